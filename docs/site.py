@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parent
-FIGURES = ("before_after", "laws")
+FIGURES = ("before_after", "law")
 PACKAGES = ("mmrjax", "calibration", "sweeps")
 #: What the tutorial about the loop was written from, and the parts of `result.json` in it.
 RECORD = DOCS / "start" / "loop.json"
@@ -367,11 +367,11 @@ if the simulated robot has a steady state at its conditions. Otherwise it slides
 Each dot is one reading: simulated minus measured, in standard deviations of the instrument. Orange is the refitted model,
 blue the model with the effects. The grey band is ± 2 standard deviations.
 
-![Influence of each effect on its readings](figures/laws.svg)
+![Influence of an effect on its readings](figures/law.svg)
 
-For each effect, the figure shows the reading that it changes most, relative to the robot without the effect. Dots are
-measured; crosses are the refitted model with nothing added. The blue line is the law with its 95 % band. If an effect is
-real, the line follows the dots.
+The figure shows the reading that an effect changes most, relative to the robot without the effect. Dots are measured;
+crosses are the refitted model with nothing added. The blue line is the law with its 95 % band. If an effect is real, the
+line follows the dots.
 
 ## May I use the robot?
 

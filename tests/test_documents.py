@@ -119,8 +119,7 @@ def comparison(log=False):
     """A simulation above the bench. Of a log as its first 2.8 s."""
     measured, table, summary = above_the_bench(rise=0.001)
     time = {"time_s": 0.1 * np.arange(len(measured))} if log else {}
-    over = {"time_s": "time [s]"} if log else None
-    return commented(table | time, summary, fit="" if log else "these", over=over, notes=("a note",))
+    return commented(table | time, summary, fit="" if log else "these", notes=("a note",), sampled=log)
 
 
 def comparison_two():
@@ -143,7 +142,14 @@ def test_fits_of_a_log_keep_the_samples_after_steps_apart():
         f"error_{speed.name}_percent": 9.0 * steps, "status": np.full(120, "ended"),
     }  # fmt: skip
     found = Comparison(
-        table, {"all": {speed.name: {"rows": 0}}}, (speed,), "log.csv", "drive", "ours", over={}, after_steps=steps
+        table,
+        {"all": {speed.name: {"rows": 0}}},
+        (speed,),
+        "log.csv",
+        "drive",
+        "ours",
+        sampled=True,
+        after_steps=steps,
     )
     _, fits = _over_time(found)[0].blocks
     (_, every, with_steps), (_, rest, without) = fits.rows

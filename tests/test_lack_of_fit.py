@@ -17,8 +17,16 @@ from calibration.discovery.result_remarks import noise_remarks_before_verdict
 from calibration.discovery.verdict import VerdictNoise
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import AdequacyFinding
-from calibration.inference.lack_of_fit import LEVEL, Residuals, _replicate_test, adequacy_of_residuals, judge_adequacy
-from calibration.inference.noise_factor import noise_factors, noise_remarks, variance_of_sums
+from calibration.inference.lack_of_fit import (
+    LEVEL,
+    Residuals,
+    _replicate_test,
+    adequacy_of_residuals,
+    judge_adequacy,
+    noise_factors,
+    noise_remarks,
+    variance_of_sums,
+)
 from calibration.inference.observers import SettledRuns
 from calibration.inference.simulation_errors import root_mean_square
 from mmrjax.model import params

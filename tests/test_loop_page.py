@@ -36,7 +36,7 @@ from calibration.words.loop_words import largest_share, p_value
 from mmrjax.model import channels
 from sweeps.commands.loop import changes_by_effect
 from sweeps.pages.figure_style import figure_settings
-from sweeps.pages.loop_figures import BLUE, draw_effect_laws
+from sweeps.pages.loop_figures import BLUE, draw_effect_law
 from sweeps.report import page_renderer
 from sweeps.report.fit_tables import Change
 from sweeps.report.loop_report import _next_step, loop_document, rows_for_figures
@@ -161,8 +161,9 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     assert places == sorted(places) and "May I use it for …" in head and "new law, 95 % band" in head
     changes = changes_by_effect(got.found)
     with figure_settings():
-        (axes,) = draw_effect_laws(got.found, rows_for_figures(got.found), changes).axes
-    (change,), size = changes.values(), got.found.effects[0].parameters["amplitude"]
+        ((name, change),) = changes.items()
+        (axes,) = draw_effect_law(got.found, rows_for_figures(got.found), name, change).axes
+    size = got.found.effects[0].parameters["amplitude"]
     largest = np.abs(change.with_it - change.without).max() / change.channel.factor
     band = band_of(axes)
     assert axes.get_xlabel() == "motor speed [rpm]"
@@ -191,9 +192,8 @@ def drawn_law(table, x_column, law, sd=0.1):
         readings_of_rows=SimpleNamespace(measured=law[:, None], before=zero, sd=zero + speed.factor),
         effects=[SimpleNamespace(name="ours", parameters={"amplitude": SimpleNamespace(value=1.0, sd=sd)})],
     )  # fmt: skip
-    change = {"ours": Change(speed, 1.0, 0 * law, law)}
     with figure_settings():
-        fig = draw_effect_laws(found, table, change)
+        fig = draw_effect_law(found, table, "ours", Change(speed, 1.0, 0 * law, law))
     fig.canvas.draw()
     legend = next(x for x in [*fig.legends, *(a.get_legend() for a in fig.axes)] if x)
     assert fig.axes[0].get_xlabel() == x_column

@@ -98,18 +98,6 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
             )
 
 
-@pytest.mark.parametrize("cells, visible", [(12, True), (40, False)])
-def test_a_wide_map_shows_numbers_that_fit_its_cells(cells, visible):
-    with figure_style.figure_settings():
-        fig, grid = figure_style.new_figure(1, 1, 6.0)
-        panel = grid[0, 0]
-        panel.imshow(np.eye(cells))
-        for k in range(1, 3):
-            panel.text(k, 4, "-.25", ha="center", va="center")
-        figure_style.figure_as_svg(fig)
-        assert [text.get_visible() for text in panel.texts] == [visible] * 2
-
-
 def test_a_chart_of_corners_does_not_warn_of_the_cut_off():
     """A warning went to the terminal, between the lines of `size`."""
     robot = paper_robots.nominal()

@@ -11,7 +11,7 @@ from calibration.data import presets_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.sources import reading
-from tests.commands import read_rig, refused, text_file
+from tests.commands import csv_text, read_rig, refused, text_file
 
 RIG = """
 base = "none"
@@ -95,7 +95,7 @@ EPISODES = {
     "observation.state": [[1.0 * k, 10.0 * k] for k in range(4)], "timestamp": [0.0, 0.1, 0.0, 0.1],
     "episode_index": [0, 0, 1, 1], "supply_voltage_V": 12.0,
 }  # fmt: skip
-#: Preset → log, channels of the robot, and columns that are read. A log is a text, a frame that is written, or a table.
+#: Preset → log, channels of the robot, and columns that are read. A log is a text, a frame, or columns of a CSV file.
 LOGS = {
     "simplefoc": (  # milliamperes, and no header
         "2.0\t2.00\t0\t150\t0\t10.0\t0.1\n3.0\t3.00\t0\t250\t0\t15.0\t0.2\n",
@@ -135,6 +135,8 @@ def test_a_log_of_a_preset_is_read(tmp_path, preset):
     elif isinstance(log, pd.DataFrame):
         log.to_parquet(tmp_path / "file-000.parquet")
         log = tmp_path / "file-000.parquet"
+    else:
+        log = text_file(tmp_path / "log.csv", csv_text(log))
     found = records.read_runs(log, robot(tmp_path, *shown), columns=preset)
     for column, values in expected.items():
         if column == "run_id":
@@ -265,13 +267,13 @@ def test_a_file_of_another_logger_is_refused_with_its_columns(tmp_path):
         )
 
 
-@pytest.mark.parametrize("imposed, refused", [("voltage", True), ("motor_speed", False)])
-def test_a_supply_without_its_duty_does_not_drive_the_motor(tmp_path, imposed, refused):
+@pytest.mark.parametrize("imposed", ["voltage", "motor_speed"])
+def test_a_supply_without_its_duty_does_not_drive_the_motor(tmp_path, imposed):
     text = "input_voltage,erpm,current_motor\n40,7000,3\n41,8000,4\n"
     (tmp_path / "log.csv").write_text(text)
-    channels = ("motor_speed", "motor_current") if refused else ("motor_current",)
+    channels = ("motor_speed", "motor_current") if imposed == "voltage" else ("motor_current",)
     rig = robot(tmp_path, *channels, imposed=imposed)
-    if refused:
+    if imposed == "voltage":
         with refused(r"has no duty_cycle; --columns vesc needs it for duty"):
             records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")
     else:

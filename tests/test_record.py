@@ -31,7 +31,7 @@ NUMBERS = ("total_current", "motor_speed", "speed", "slip", "traction", "power_g
 def test_table8_is_as_recorded(name):
     was, robot = columns_of(RECORD / "table8.csv"), nominal()
     conditions = Conditions(
-        was["configuration"], was["supply_voltage_V"], was["slope_deg"], was["payload_kg"]
+        was["configuration"].tolist(), was["supply_voltage_V"], was["slope_deg"], was["payload_kg"]
     ).resolved(robot)
     fidelity = fidelities.get_fidelity(name)
     result = fidelity.run(robot, conditions, fidelity.facts.resolved(), lambda share: None).result

@@ -79,8 +79,8 @@ def test_few_points_fill_few_bins():
     """No panel is empty where samples have few points each."""
     resistance, voltage = np.tile(np.linspace(0.5, 0.7, 12), 2), np.repeat([15.0, 33.0], 12)
     varied = {
-        "voltage": sweep_figures.VariedQuantity(voltage, "V"),
-        "r": sweep_figures.VariedQuantity(resistance, "r"),
+        "voltage": sweep_report.VariedQuantity(voltage, "V"),
+        "r": sweep_report.VariedQuantity(resistance, "r"),
     }
     histogram, *bands, _, _ = sweep_figures.draw_output_spread(0.1 * voltage + resistance, "I", varied).axes
     assert [len(b.lines[0].get_xdata()) for b in bands] == [2, 6] and len(histogram.patches) == 6

@@ -153,7 +153,6 @@ def test_command_leaves_indices_as_its_schema_says(mmrjax, tmp_path):
 def test_an_output_that_nothing_changes_has_no_figures(monkeypatch):
     """A yaw rate beside straight travel: one without bars leaves no room for its axes."""
     shares = {"speed": np.array([0.4, 0.6]), "yaw_rate": np.zeros(2)}
-    monkeypatch.setattr(sensitivity_report, "_sentence", lambda *_: "a sentence")
     monkeypatch.setattr(sensitivity_report, "_inputs", lambda *_: "a table")
     one = {"studied": np.array([True]), "value": np.zeros(1), "row": SimpleNamespace(label=""), "second": None}
     outputs = {k: SimpleNamespace(overall_share=v, **one) for k, v in shares.items()}

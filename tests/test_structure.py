@@ -709,17 +709,14 @@ MORE_NAMES = {
     "sweeps/commands/turn.py": 27,
     "sweeps/inputs.py": 39,
     # Reports, stores and exports show every part of a result.
-    "sweeps/pages/history_figures.py": 26,
     "sweeps/paper/report.py": 32,
     "sweeps/points/axes.py": 27,
     "sweeps/points/run.py": 37,
     "sweeps/points/tasks.py": 33,
     "sweeps/points/zarr_store.py": 29,
-    "sweeps/report/climb_report.py": 26,
-    "sweeps/report/export_report.py": 26,
-    "sweeps/report/loop_report.py": 30,
+    "sweeps/report/loop_report.py": 29,
     "sweeps/report/mission_report.py": 30,
-    "sweeps/report/runs_report.py": 30,
+    "sweeps/report/runs_report.py": 29,
     "sweeps/report/sweep_report.py": 27,
 }
 

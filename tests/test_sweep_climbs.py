@@ -14,8 +14,9 @@ from mmrjax.fidelities.variation import STATUS, Variation
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
-from sweeps.pages.sweep_figures import VariedQuantity, draw_grid_statuses
+from sweeps.pages.sweep_figures import draw_grid_statuses
 from sweeps.points import axes, scale, tasks
+from sweeps.report.sweep_report import VariedQuantity
 from tests.commands import ends, read_json, refused
 
 ROBOT = nominal()

@@ -8,6 +8,7 @@ import pytest
 
 import mmrjax as api
 from calibration.data import robot_file
+from mmrjax.derived.start_figures import stages_of_start
 from mmrjax.model import paper_robots, signals
 from sweeps.commands.simulate import run_remarks
 from sweeps.pages import figure_style, history_figures, words
@@ -107,8 +108,8 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
         assert start.ended[0] == pytest.approx(abs(float(found.total_current[k])), rel=1e-6)
         assert start.ended[1] == pytest.approx(1e3 * abs(float(found.speed[k])), rel=1e-6)
         assert start.gets_under_way and start.current.max() > 90
-    assert (up.sense, back.sense) == (1.0, -1.0)  # the way back is drawn as the way there
-    assert (up.starting, up.slipping, up.settled) == pytest.approx((back.starting, back.slipping, back.settled))
+    assert (up.stages.sense, back.stages.sense) == (1.0, -1.0)  # the way back is drawn as the way there
+    assert (*up.stages.bounds, up.stages.settled) == pytest.approx((*back.stages.bounds, back.stages.settled))
     flat = api.simulate(robot, api.Conditions(0, 33.0, 0.0), "drive", duration=5.0)
     assert up.ended[0] > 1.2 * float(flat.total_current)
 
@@ -162,5 +163,6 @@ def test_rated_limits_stand_in_the_report(robot):
 def test_a_run_without_current_is_drawn():
     """Nothing drives its motors: no scale of nothing."""
     time = np.linspace(0.0, 1.0, 30)
-    still = history_figures.StartRun("run 1", "6T2A", "stalled", time, *3 * [0 * time], stages=None)
+    stages = stages_of_start(time, *3 * [0 * time], 0.02)
+    still = history_figures.StartRun("run 1", "6T2A", "stalled", stages, time, *3 * [0 * time])
     figure_style.figure_as_svg(history_figures.draw_starts([still]))

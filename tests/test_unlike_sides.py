@@ -75,7 +75,7 @@ def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys
     )
     assert f"{turning} rad/s and 1.31 m/s (--left" in remark
     assert "6T2A" not in remark  # whose sides are alike
-    assert [w.text for w in page_renderer.robot_section(file)["warnings"]] == [". ".join(file.remarks)]
+    assert [w.text for w in page_renderer.robot_warnings(file)] == [". ".join(file.remarks)]
     assert inputs.load_robot(config.Simulate(robot=file.source, left_V=9.0, right_V=9.0)).remarks == ()
     assert of_file(tmp_path, SIDE_RADIUS.replace("0.01", "0.0")).remarks == ()
     (narrow,) = of_file(tmp_path, SIDE_RADIUS, set={"4W2T.turning.width": 0.0}).remarks

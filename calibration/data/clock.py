@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import math
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -213,7 +213,7 @@ def _date_seconds(cell: str) -> float:
 CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", LOAD, "surface", "duty", "mode", "held")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class ConstantInterval:
     """Consecutive samples of a run under the same conditions.
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import math
 import re
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -149,7 +149,7 @@ def match_column_names(
     Raises:
         BadData: a name occurs twice.
     """
-    every = dataclasses.replace(layout, channels=channels.EVERY)
+    every = replace(layout, channels=channels.EVERY)
     spelled: dict[str, set[str]] = {}
     for column in (every if inferred else layout).spellings():
         spelled.setdefault(column.casefold(), set()).add(column)
@@ -169,7 +169,7 @@ def match_column_names(
         turns = of_turns and {*layout.sides, *VOLTS, *HEADING} & present
         more = channels.EVERY if inferred else channels.OF_TURNS if turns else ()
         read = (c for c in channels.EVERY if c in layout.channels or (c in more and c.column in present))
-        layout = dataclasses.replace(layout, channels=tuple(read))
+        layout = replace(layout, channels=tuple(read))
     return matched_names, layout, tuple(notes)
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import functools
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from calibration.data import Mapped, Names
@@ -63,7 +63,7 @@ WORDS = tuple(label.column for label in quantities.LABELS)
 ALIKE = 0.6
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Column:
     """A column of a file and the quantity that it holds.
 
@@ -98,7 +98,7 @@ class Column:
         return (low, high) if self.factor > 0 else (high, low)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Layout:
     """Properties of a robot that determine the columns of its tables.
 
@@ -121,7 +121,7 @@ class Layout:
     configurations: Names = ()
     instruments: tuple[Instrument, ...] = ()
     mapped: Mapped = ()
-    channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual_channels)
+    channels: tuple[Channel, ...] = field(default_factory=channels.usual_channels)
     supply: float = 0.0
 
     @classmethod
@@ -235,7 +235,7 @@ class Layout:
                     f"{source}: the robot's file reads {mine} from column {column}; mmrjax has no column {mine} "
                     f"(known: {', '.join(self.known())})"
                 )
-            meanings.append(None if meant is None else dataclasses.replace(meant, shown=column, factor=factor))
+            meanings.append(None if meant is None else replace(meant, shown=column, factor=factor))
         first: dict[str, Column] = {}
         for meaning in filter(None, meanings):
             twin = first.setdefault(meaning.column, meaning)

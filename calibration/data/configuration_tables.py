@@ -7,10 +7,10 @@ free, and all others follow the first configuration (`rig.surfaces`).
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, fields, replace
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -90,11 +90,11 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
             members |= added
         first = configuration if is_kept else separate[0]
         leaders |= {name: first for name in added if name != first}
-    rig = dataclasses.replace(robot.rig, surfaces=tuple(leaders.items()))
-    robot = dataclasses.replace(robot, configurations=Configurations(members), rig=rig)
+    rig = replace(robot.rig, surfaces=tuple(leaders.items()))
+    robot = replace(robot, configurations=Configurations(members), rig=rig)
     priors = values_of_surface_configurations({name: (mean, sd) for name, mean, sd in rig.priors}, robot, runs)
-    rig = dataclasses.replace(rig, priors=tuple((name, *value) for name, value in priors.items()))
-    return dataclasses.replace(robot, rig=rig)
+    rig = replace(rig, priors=tuple((name, *value) for name, value in priors.items()))
+    return replace(robot, rig=rig)
 
 
 def values_of_surface_configurations(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, V]:
@@ -308,7 +308,7 @@ def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassi
     if like is not None:
         return have[stated_word(like, have.names, f"{where}.like")]
     if movers is not None:
-        pattern = dataclasses.replace(have.members[0], on_tracks=_movers(movers, where))
+        pattern = replace(have.members[0], on_tracks=_movers(movers, where))
         _reject_incomplete(
             f"{where}: with movers instead of like, the configuration must be described completely",
             _missing_parameters(pattern, table),
@@ -332,9 +332,9 @@ def _missing_parameters(component: eqx.Module, table: Json) -> list[str]:
 
 def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, float | None]]:
     """Default of every parameter of a component, or None."""
-    for field in dataclasses.fields(component):
+    for field in fields(component):
         value = getattr(component, field.name)
         if "spec" in field.metadata:
-            yield f"{prefix}{field.name}", None if field.default is dataclasses.MISSING else float(field.default)
+            yield f"{prefix}{field.name}", None if field.default is MISSING else float(field.default)
         elif isinstance(value, eqx.Module):
             yield from _parameter_defaults(value, f"{prefix}{field.name}.")

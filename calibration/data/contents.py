@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ GAP = 5.0
 _COUNT, RISING = re.compile(r"time|tick|stamp"), 0.9
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class SignalFacts:
     """Properties of a signal of a file.
 
@@ -55,7 +55,7 @@ class SignalFacts:
     clock: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class FileContents:
     """Description of a data file.
 
@@ -76,7 +76,7 @@ class FileContents:
 
     def to_json(self) -> Json:
         """The contents as JSON-able data."""
-        return {"schema": "mmrjax.inspect/1", **dataclasses.asdict(self)}
+        return {"schema": "mmrjax.inspect/1", **asdict(self)}
 
 
 def inspect_source(source: str | Path | Any) -> FileContents:
@@ -102,7 +102,7 @@ def inspect_source(source: str | Path | Any) -> FileContents:
         notes.append(
             f"{name}: signals have {len(clocks)} clocks. Rows are taken at the samples of the densest channel"
         )
-    read = [dataclasses.replace(s, refused=f.refused) for s, f in zip(signals, facts, strict=True)]
+    read = [replace(s, refused=f.refused) for s, f in zip(signals, facts, strict=True)]
     constant = {fact.path for fact in facts if fact.least == fact.greatest}
     lines = dict(_proposed_columns(sorted(read, key=lambda s: s.path in constant)))  # of several, one that changes
     proposed = () if preset else tuple(lines[s.path] for s in signals if s.path in lines)
@@ -115,7 +115,7 @@ def _source(source: Any) -> Source:
     if group := opening.files_of_group(str(source)):
         first_source = _source(group[0])
         note = f"{source}: {len(group)} files, each a run; these are the signals of {group[0].name}"
-        return dataclasses.replace(first_source, notes=(note, *first_source.notes))
+        return replace(first_source, notes=(note, *first_source.notes))
     path, signal_path = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():
@@ -155,20 +155,20 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, np.ndarray | st
     try:
         values = signal.load()
     except BadData as error:
-        return dataclasses.replace(facts, refused=str(error).partition(f"{signal.path}: ")[2] or str(error))
+        return replace(facts, refused=str(error).partition(f"{signal.path}: ")[2] or str(error))
     if values.dtype.kind in "US":
-        return dataclasses.replace(facts, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
+        return replace(facts, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
     values = np.asarray(values.astype(np.int64) if values.dtype.kind in "mM" else values, float)
     finite = values[np.isfinite(values)]
     if len(finite):
-        facts = dataclasses.replace(facts, least=float(finite.min()), greatest=float(finite.max()))
+        facts = replace(facts, least=float(finite.min()), greatest=float(finite.max()))
     rate = gaps = np.nan
     if clock is not None:
         time = times[id(clock)] = times[id(clock)] if id(clock) in times else _seconds(clock)
         if not isinstance(time, str) and len(time) == len(values):
             step, usual = np.diff(time), one_clock.usual_step(time)
             rate, gaps = 1 / usual, float((step > GAP * usual).sum())
-    return dataclasses.replace(facts, missing=len(values) - len(finite), rate=rate, gaps=gaps)
+    return replace(facts, missing=len(values) - len(finite), rate=rate, gaps=gaps)
 
 
 def _seconds(clock: Clock) -> np.ndarray | str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -62,8 +62,7 @@ def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Nam
     for side, row in np.argwhere(np.abs(volts) > np.abs(supply) * (1 + ROUNDED))[:1].tolist():
         raise BadData(
             f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} V at a supply of {supply[row]:g} V; "
-            f"expected no more than {SUPPLY}, or remove that column: the larger of the two side voltages is then "
-            "the supply voltage"
+            f"expected no more than {SUPPLY}, or remove that column"
         )
     origin = SUPPLY if SUPPLY in columns else f"{SUPPLY}, the larger of both"
     columns |= {SUPPLY: supply, **dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))}
@@ -340,4 +339,4 @@ def unwrap_angle(runs: Runs, column: str) -> Runs:
         raise BadData(f"{place}: jumps by {float(f'{step[jump]:.4g}'):g} {unit} from the sample before, {why}")
     if not note:
         return runs
-    return dataclasses.replace(runs, columns={**runs.columns, column: readings}, notes=(*runs.notes, note))
+    return replace(runs, columns={**runs.columns, column: readings}, notes=(*runs.notes, note))

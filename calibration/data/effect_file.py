@@ -4,7 +4,6 @@ library.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import importlib.machinery
@@ -15,6 +14,7 @@ import os
 import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -59,7 +59,7 @@ def readable_signals(
             (`balances.moving_signals`).
     """
     signals_read: list[Signals] = []
-    watched = dataclasses.replace(robot, effects=(_effect_that_records_signals(balance, channel, signals_read),))
+    watched = replace(robot, effects=(_effect_that_records_signals(balance, channel, signals_read),))
     order = balances.settled_signals if settled else balances.moving_signals
     signals = order(watched, conditions, state)
     balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
@@ -238,7 +238,7 @@ def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signal
     before = "slip" if balance in ROUND else balance
     climbs, points = readable_signals(robot, run, climbing, before, channel), moving_signals(robot, run, climbing)
     signals_at_rest = readable_signals(robot, run, state_at_rest, before, channel)
-    return dataclasses.replace(climbs, **TURN), dataclasses.replace(points, **TURN), signals_at_rest
+    return replace(climbs, **TURN), replace(points, **TURN), signals_at_rest
 
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
@@ -247,18 +247,16 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
 
     def term(amplitude: jax.Array, signals: Signals) -> jax.Array:
         # The robot file checks configurations that the nominal robot does not have.
-        effect_of_amplitude = dataclasses.replace(
-            params.replace(effect(), {"amplitude": amplitude}), configurations=()
-        )
-        with_it = dataclasses.replace(robot, effects=(effect_of_amplitude,))
+        effect_of_amplitude = replace(params.replace(effect(), {"amplitude": amplitude}), configurations=())
+        with_it = replace(robot, effects=(effect_of_amplitude,))
         return jnp.asarray(effects_sum(with_it, signals, effect.balance, effect.channel), float)
 
     for configuration in range(len(robot.configurations)):
         known, points, points_at_rest = (
-            dataclasses.replace(s, memory=memory) for s in _test_points(effect.balance, effect.channel, configuration)
+            replace(s, memory=memory) for s in _test_points(effect.balance, effect.channel, configuration)
         )
-        mirrored = dataclasses.replace(known, **{name: -value for name, value in TURN.items()})
-        external = dataclasses.replace(known, battery=jnp.zeros(()))
+        mirrored = replace(known, **{name: -value for name, value in TURN.items()})
+        external = replace(known, battery=jnp.zeros(()))
         try:
             term_at_zero, term_at_size, term_at_double = (term(jnp.asarray(k * size), known) for k in (0.0, 1.0, 2.0))
             term_of_external_supply, fed = (term(jnp.asarray(size), s) for s in (points, external))

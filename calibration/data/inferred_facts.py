@@ -7,9 +7,9 @@ to a file with another.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -197,4 +197,4 @@ def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
     instruments = (*instruments, *(i for i in of_table if i.channel not in named))
     if instruments == stated:
         return robot
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=instruments))
+    return replace(robot, rig=replace(robot.rig, instruments=instruments))

@@ -159,9 +159,8 @@ def csv_bytes(path: Path, where: str | Path) -> bytes:
     format_name = format_name or next((word for begin, word in TEXTS.items() if begin.match(content)), None)
     if format_name is not None:
         raise BadData(
-            f"{where}: is {format_name}; expected CSV (a header line, then one line for each row), Parquet, or "
-            "another format of docs/howto/formats.md; export it as CSV, from Python with "
-            "pandas.DataFrame(...).to_csv(..., index=False)"
+            f"{where}: is {format_name}; expected CSV, Parquet, or "
+            "another format of docs/howto/formats.md; export it as CSV"
         )
     return content
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,7 @@ MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
 Check = tuple[str, np.ndarray, str | Callable[[int], str]]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class NamedArrays:
     """Named columns of one source. `runs.runs_of_arrays` checks them and converts them to `Runs`.
 
@@ -55,12 +55,12 @@ class NamedArrays:
         """
         index = np.flatnonzero(kept)
         values = tuple(v[index] if isinstance(v, np.ndarray) else [v[k] for k in index] for v in self.values)
-        return dataclasses.replace(self, values=values, notes=(*self.notes, f"{self.name}: {note}"))
+        return replace(self, values=values, notes=(*self.notes, f"{self.name}: {note}"))
 
     def with_columns(self, columns: Mapping[str, np.ndarray]) -> NamedArrays:
         """Copy with additional columns of numbers, which replace columns of the same name."""
         columns_left = [k for k, column in enumerate(self.header) if column not in columns]
-        return dataclasses.replace(
+        return replace(
             self,
             header=(*(self.header[k] for k in columns_left), *columns),
             values=(*(self.values[k] for k in columns_left), *columns.values()),

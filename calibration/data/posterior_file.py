@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ NORMAL, LOG, ANGLE = "normal", "log-normal", "angle"
 APART = 0.05
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Posterior:
     """Joint posterior of parameters: a normal distribution of coordinates z, and the parameters as functions of z.
 

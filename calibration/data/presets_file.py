@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fnmatch
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ KEYS_OF_NUMBER = ("about", "usual")
 SEPARATOR = ","
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class PresetColumn:
     """A column of this program, and the column of a logger's file from which it is read.
 
@@ -67,7 +67,7 @@ class PresetColumn:
     zero: float = 0.0
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Preset:
     """Meaning of the columns of a logger's files.
 
@@ -133,15 +133,6 @@ class Preset:
 NONE = Preset("", ())
 
 
-def preset_of_table(columns: Mapping[str, Any]) -> Preset:
-    """Preset from a table `[columns]`.
-
-    Raises:
-        BadConfiguration: for the same reasons as `parse_preset`.
-    """
-    return _parsed({"columns": dict(columns)}, "the stated table", {})
-
-
 def find_preset(stated: str | Path) -> Preset:
     """Packaged preset with a name, or the preset in a file. Numbers that the preset needs may follow.
 
@@ -162,13 +153,14 @@ def find_preset(stated: str | Path) -> Preset:
                 f"--columns {name}: got {key}{equals}{text}; expected a name and a number, such as pole_pairs=7"
             ) from error
     if name in PACKAGED:
-        return parse_preset(_packaged_text(name), name, numbers)
+        return parse_preset(_packaged_content(name), name, numbers)
     path = Path(name)
     if not path.exists():
         raise BadConfiguration(
             f"--columns: got {name}; no such file and no packaged preset; {allowed_words(name, PACKAGED)}"
         )
-    return parse_preset(input_files.toml_text(path, path.name), path.name, numbers)
+    content = input_files.toml_content(input_files.toml_text(path, path.name), path.name)
+    return parse_preset(content, path.name, numbers)
 
 
 def recognise_preset(names: Sequence[str]) -> str:
@@ -180,8 +172,8 @@ def recognise_preset(names: Sequence[str]) -> str:
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
     matches = {"": OF_A_PRESET - 1}
     for name in PACKAGED:
-        columns = parse_preset(_packaged_text(name), name, dict.fromkeys(numbers_to_state(name), 1.0)).columns
-        matches[name] = sum(any(_matches_any(pattern, ends) for pattern in column.theirs) for column in columns)
+        preset = parse_preset(_packaged_content(name), name, dict.fromkeys(numbers_to_state(name), 1.0))
+        matches[name] = sum(any(_matches_any(pattern, ends) for pattern in c.theirs) for c in preset.columns)
     return max(matches, key=lambda name: matches[name])
 
 
@@ -191,28 +183,25 @@ def _matches_any(theirs: str, names: set[str]) -> bool:
 
 def numbers_to_state(name: str) -> Names:
     """Names of the numbers that the user must give for a packaged preset."""
-    numbers = input_files.toml_content(_packaged_text(name), name).get("ask", {})
+    numbers = _packaged_content(name).get("ask", {})
     return tuple(key for key, number in numbers.items() if isinstance(number, str) or "usual" not in number)
 
 
-def _packaged_text(name: str) -> str:
-    return (resources.files("calibration") / "data" / "presets" / f"{name}.toml").read_text("utf-8")
+def _packaged_content(name: str) -> Json:
+    text = (resources.files("calibration") / "data" / "presets" / f"{name}.toml").read_text("utf-8")
+    return input_files.toml_content(text, name)
 
 
-def parse_preset(text: str, where: str, given: Mapping[str, float]) -> Preset:
-    """Reads a preset from a TOML text.
+def parse_preset(content: Json, where: str, given: Mapping[str, float]) -> Preset:
+    """Preset from a table, such as the content of a file.
 
     Args:
         where: beginning of the error message.
         given: numbers given by the user, by name.
 
     Raises:
-        BadConfiguration: the text is no TOML, a key or a column is unknown, or a required number is missing.
+        BadConfiguration: a key or a column is unknown, or a required number is missing.
     """
-    return _parsed(input_files.toml_content(text, where), where, given)
-
-
-def _parsed(content: Json, where: str, given: Mapping[str, float]) -> Preset:
     for key in content:
         stated_word(key, KEYS, where, f"got the key {key}")
     numbers = _preset_numbers(content.get("ask", {}), where, given)

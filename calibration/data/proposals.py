@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,7 +71,7 @@ SAME_RATE, INTEGRAL = 0.03, 0.05
 BY_UNIT = ("supply_voltage", "total_current", "motor_speed", "winding_temperature")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class ColumnCandidate:
     """A signal and the quantity that it may show.
 
@@ -337,4 +337,4 @@ def _currents_by_duty(candidates: Iterable[ColumnCandidate]) -> Iterator[ColumnC
     for candidate in pool:
         quantity = meant.get(id(candidate), candidate.quantity)
         column = candidate.column.replace(candidate.quantity, quantity)
-        yield dataclasses.replace(candidate, quantity=quantity, column=column)
+        yield replace(candidate, quantity=quantity, column=column)

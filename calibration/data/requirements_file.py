@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -43,7 +43,7 @@ RATED = "rated"
 RATINGS = ("winding_C", "motor_speed_rpm", "gearbox_speed_rpm", "gearbox_Nm")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Envelope:
     """Ranges of the conditions under which a requirement must be met.
 
@@ -85,7 +85,7 @@ class Envelope:
         return all(a is None or b is None or (a[0] <= b[1] and b[0] <= a[1]) for a, b in pairs)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Requirement:
     """One requirement: a quantity with a limit.
 
@@ -118,7 +118,7 @@ class Requirement:
         return "least" if self.least else "most"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Requirements:
     """A file of requirements.
 
@@ -239,7 +239,7 @@ def _updated_envelope(base: Envelope, stated: Json, where: str) -> Envelope:
         envelope["battery"] = False
     elif "state_of_charge" in envelope and not envelope.setdefault("battery", True):
         raise BadConfiguration(f"{where}: state_of_charge needs the battery; got battery = false")
-    merged = dataclasses.replace(base, **envelope)
+    merged = replace(base, **envelope)
     if not merged.battery and merged.supply_voltage_V is None:
         raise BadConfiguration(f"{where}: battery = false needs supply_voltage_V, which is missing")
     return merged
@@ -275,7 +275,7 @@ def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str
             raise BadConfiguration(
                 f"{where}: an end of charge needs the battery, but the envelope sets another supply"
             )
-        envelope = dataclasses.replace(envelope, state_of_charge=(envelope.charge_end, envelope.charge_end))
+        envelope = replace(envelope, state_of_charge=(envelope.charge_end, envelope.charge_end))
     share = _parse_share(table.get("duty"), table.get("share"), where)
     return [
         Requirement(name, limit, sense == "least", envelope, share, source, depth) for sense, limit in limits.items()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,7 +31,7 @@ STAGES, EFFICIENCY = 100.0, 0.85
 FAR, RISING = 100.0, 3
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class DerivedFact:
     """A value that follows from the numbers of a rig, for a plausibility check.
 
@@ -137,7 +137,7 @@ def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterat
         stall = float(robot.motor.current_stall(limit))
         if current > stall:
             odd = f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move. "
-            fact = dataclasses.replace(fact, odd=f"{odd}Check {places}")
+            fact = replace(fact, odd=f"{odd}Check {places}")
     yield fact
 
 
@@ -170,7 +170,7 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     weight = load["mass"] * GRAVITY
     resistance = load["ground.rolling_resistance"] + load["track.guide_friction"] * load["track.guide_share"]
     fact = _fact(f"{name}: weight", load["mass"], "kg", (0.05, 2000), f"is {name}.mass in kg?")
-    yield dataclasses.replace(fact, value=f"{fact.value}, {three_digits(weight)} N")
+    yield replace(fact, value=f"{fact.value}, {three_digits(weight)} N")
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
     torque = weight * resistance * radius / sides + loss
     yield from _current_fact(robot, f"{name}: current to roll slowly on the flat", torque, places)
@@ -178,7 +178,7 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     grip = math.degrees(math.atan(static))
     fact = _fact(f"{name}: steepest slope without sliding", grip, "", (5, 60), "check friction.static")
     odd = "it cannot move on the flat: friction.static is below the resistance" * (static <= resistance)
-    yield dataclasses.replace(fact, value=f"{grip:.0f}°", odd=odd or fact.odd)
+    yield replace(fact, value=f"{grip:.0f}°", odd=odd or fact.odd)
     if limit is None or not robot.knows(["motor.resistance"]):
         return
     pull = (_output_torque_at(robot, float(motor.current_stall(limit))) - loss) * sides / radius
@@ -439,7 +439,7 @@ def log_doubts(runs: Runs, robot: Robot) -> Names:
     return tuple(filter(None, doubts))
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class NumberOrigin:
     """Origin of a parameter value.
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from calibration.data import Json, Mapped, Names
@@ -192,10 +192,17 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
 
     imposed, start, between = word("imposed", IMPOSED), word("start", STARTS), word("between_rows", BETWEEN)
     usual = [name for name in channels.USUAL if name != imposed and (travels or name != "speed")]
-    names = _parse_channels(content.pop("channels", usual), f"{where}, channels")
+    every, place = channels.channel_names(channels.EVERY), f"{where}, channels"
+    listed = f"a list of channels, at least one of {', '.join(every)}"
+    stated = stated_names(content.pop("channels", usual), place, listed)
+    for name in stated:
+        stated_word(name, every, place)
+        if stated.count(name) > 1:
+            raise BadConfiguration(f"{place}: {name} is repeated; expected each channel once")
+    names = tuple(name for name in every if name in stated)
     if idle := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
         raise BadConfiguration(
-            f"{where}, channels: {min(idle)} is imposed, so it cannot be a reading; remove it, or set imposed = "
+            f"{place}: {min(idle)} is imposed, so it cannot be a reading; remove it, or set imposed = "
             f'"{next(word for word in IMPOSED if word != imposed)}"'
         )
     surfaces = stated_as(content.pop("surfaces", {}), dict, f"{where}, surfaces", "a table [surfaces]")
@@ -212,16 +219,6 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
         surfaces=tuple(surfaces.items()),
         inherits=inherits,
     )
-
-
-def _parse_channels(stated: Any, where: str) -> Names:
-    channel_names = channels.channel_names(channels.EVERY)
-    stated_names(stated, where, f"a list of channels, at least one of {', '.join(channel_names)}")
-    for name in stated:
-        stated_word(name, channel_names, where)
-        if stated.count(name) > 1:
-            raise BadConfiguration(f"{where}: {name} is repeated; expected each channel once")
-    return tuple(name for name in channel_names if name in stated)
 
 
 #: Word for an instrument property that is inferred from its table.
@@ -335,7 +332,7 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
         if name not in parameters:
             raise BadConfiguration(f"{where}, {name}: only parameters may have a ±; give the number without it")
     priors = tuple((name, float(p.value), sds[name]) for name, p in parameters.items() if name in sds)
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
+    return replace(robot, rig=replace(robot.rig, priors=priors))
 
 
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
@@ -364,14 +361,6 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
             size = FREE if instrument.quantum is None else instrument.quantum / channel.factor
             lines.append(f"quantum = {toml_value(size)}  # [{channel.unit}] step of its readings")
     return head, tables
-
-
-def value_text(name: str, value: float, rig: Rig) -> str:
-    """Value of a parameter as written in a file, with ± if its prior is stated and the value is unchanged."""
-    for prior_name, mean, sd in rig.priors:
-        if prior_name == name and mean == value:
-            return f'"{value!r} ± {sd!r}"'
-    return repr(value)
 
 
 def is_default_rig(rig: Rig) -> bool:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ FACTORS = "scaled"
 CURVE = {"battery.curvature", "battery.slope"}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class RobotFile:
     """A robot and the origin of its numbers.
 
@@ -241,9 +241,9 @@ def _robot_before_parameters(
         )
     controller = Controller() if rig.follows_goal else None
     if base is not None:
-        robot = dataclasses.replace(base, configurations=Configurations(loads), rig=rig, controller=controller)
+        robot = replace(base, configurations=Configurations(loads), rig=rig, controller=controller)
         return robot, sds, linear
-    robot = dataclasses.replace(paper_robots.blank_robot(Configurations(loads), rig=rig), controller=controller)
+    robot = replace(paper_robots.blank_robot(Configurations(loads), rig=rig), controller=controller)
     parameters, values = params.parameters_by_name(robot), input_files.flat_table(content)
     defaults = {name: value for name, (value, _) in rig_file.DEFAULTS.items()}
     resistance = values.get("motor.resistance", float(robot.motor.resistance))
@@ -302,8 +302,8 @@ def add_effects(
         acting = stated_names(acting, place, f"a list of {', '.join(robot.configurations)}", least=0)
         for c in acting:
             stated_word(c, robot.configurations, place)
-        present.append(dataclasses.replace(effect, configurations=acting))
-    return dataclasses.replace(robot, effects=tuple(present))
+        present.append(replace(effect, configurations=acting))
+    return replace(robot, effects=tuple(present))
 
 
 def change_robot(robot: Robot, values: Mapping[str, Any], where: str) -> Robot:
@@ -332,11 +332,11 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str) -> Robot:
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in new_values.items()})
     priors = tuple((name, float(new_values.get(name, mean)), sd) for name, mean, sd in robot.rig.priors)
-    rig = dataclasses.replace(robot.rig, priors=priors)  # centred on the new values
-    robot = dataclasses.replace(robot, sides=settings.pop("sides", robot.sides), rig=rig)
+    rig = replace(robot.rig, priors=priors)  # centred on the new values
+    robot = replace(robot, sides=settings.pop("sides", robot.sides), rig=rig)
     for name, value in settings.items():
         part, _, key = name.partition(".")
-        robot = dataclasses.replace(robot, **{part: dataclasses.replace(getattr(robot, part), **{key: value})})
+        robot = replace(robot, **{part: replace(getattr(robot, part), **{key: value})})
     _check_pairs(robot, where)
     return _add_required_states(robot, where)
 
@@ -385,7 +385,7 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
             )
     controller = robot.controller
     if controller is not None:
-        controller = dataclasses.replace(controller, lags=float(controller.lag) > 0)
+        controller = replace(controller, lags=float(controller.lag) > 0)
         if controller.rate and controller.lags:
             raise BadConfiguration(
                 f"{where}, controller.lag: got {float(controller.lag):g} s with rate = {controller.rate:g}; a held "
@@ -396,7 +396,7 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
                 f"{where}, controller.samples_late: got {controller.samples_late:g} with rate = "
                 f"{controller.rate:g}; expected 0, or with a rate 1"
             )
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=controller)
+    return replace(robot, rig=replace(robot.rig, loose=bool(loose)), controller=controller)
 
 
 def _check_setting(where: str, name: str, value: Any) -> Any:
@@ -497,6 +497,7 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
     needed = {*rig_file.required_parameters(robot.rig, params.values_by_name(robot))}
     needed |= {*nothing.rig.unknown} - {*robot.rig.unknown}
     needed |= frozenset() if inherits else robot.rig.stated
+    sds = {(name, mean): sd for name, mean, sd in robot.rig.priors}
     always = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk_parameters(robot):
         name, spec, value = parameter.name, parameter.spec, float(parameter.value)
@@ -510,7 +511,9 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
         origin = ""
         if inherits and was is not None:
             origin = f"; {spec.source}" if value == was else f"; nominal {was:g}: {spec.source}"
-        text = rig_file.value_text(name, value, robot.rig)
+        text, sd = repr(value), sds.get((name, value))  # unless the prior's centre was changed
+        if sd is not None:
+            text = f'"{value!r} ± {sd!r}"'
         yield table, f"{key} = {text}  # [{spec.unit}] {spec.meaning}{origin}"
 
 

@@ -163,7 +163,7 @@ def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
         return is_distinct, ()
     return is_distinct, (
         f"{name}: {_rows_are(again)} a repetition of the row before, with the same time. Repetitions are left out "
-        "and not counted in row numbers",
+        "and not counted",
     )
 
 
@@ -322,8 +322,8 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
         sloped = int(np.count_nonzero(slope))
         rows_text = f", as in {sloped} of {len(slope)} rows" if sloped > 1 else ""
         why = (
-            f" in a table of settled turns{rows_text}; expected 0, since a turn never settles on a slope. Remove "
-            "these rows. To simulate one: simulate --model drive --left --right --slope"
+            f" in a table of settled turns{rows_text}; expected 0, since a turn never settles on a slope. To "
+            "simulate one: simulate --model drive --left --right --slope"
         )
         check_rows(name, columns, [("slope_deg", slope, why)])
     check_rows(name, columns, checks)
@@ -383,7 +383,7 @@ def _missing_signs(columns: Columns, layout: Layout) -> Iterator[Check]:
             continue
         column, readings = channel.column, columns[channel.column]
         if layout.magnitude(channel.name):
-            why = "; expected no negative reading, since by the robot's file the instrument shows only the magnitude"
+            why = "; expected no negative reading of an instrument that shows only the magnitude"
             yield column, readings < 0, why
             continue
         if may_drive and not channel.zero_at_rest:

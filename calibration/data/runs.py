@@ -6,9 +6,9 @@ meaning, checks the values and returns `Runs`.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ def read_runs(
     layout, between = Layout.of(robot), "held" if robot is None else robot.rig.between_rows
     preset = presets_file.NONE
     if isinstance(columns, Mapping):
-        preset = presets_file.preset_of_table(columns)
+        preset = presets_file.parse_preset({"columns": dict(columns)}, "the stated table", {})
     elif columns is not None:
         preset = presets_file.find_preset(columns)
     if isinstance(source, str | Path) and str(source) in PACKAGED:
@@ -128,7 +128,7 @@ def runs_of_arrays(
     """
     name, layout = arrays.name, Layout.of(robot)
     if mapped is not None:
-        layout = dataclasses.replace(layout, mapped=mapped)
+        layout = replace(layout, mapped=mapped)
     if not arrays.header:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
@@ -159,7 +159,7 @@ def runs_of_arrays(
     instruments = inferred_facts.infer_instruments(layout.instruments, columns)
     unsigned = contradictions.unsigned_current_channels(columns, layout) if measured else ()
     unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in instruments})
-    layout = dataclasses.replace(layout, instruments=(*instruments, *unsigned))
+    layout = replace(layout, instruments=(*instruments, *unsigned))
     row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(int(is_kept.sum()), np.nan)
@@ -281,10 +281,7 @@ def _reject_readings(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Lay
         why = " together with --battery, whose charge sets the voltage; leave the cell empty or remove the column"
     else:
         is_given &= column_numbers(raw) != 0
-        why = (
-            "; the robot's load is a shaft, on which no slope, payload or mass acts. Remove the column, or describe "
-            "the load as a vehicle"
-        )
+        why = "; the robot's load is a shaft, on which it does not act. Remove the column, or describe a vehicle"
         if layout.has_ground:
             why = f"; {NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
     for row in np.flatnonzero(is_given)[:1].tolist():

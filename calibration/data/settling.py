@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import jax.numpy as jnp
@@ -61,7 +61,7 @@ REASONS = (
 )  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Signal:
     """Readings of a channel in settled travel, sample by sample.
 
@@ -94,7 +94,7 @@ class Signal:
 Inertia = tuple[str, str, float, float]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Stretch:
     """Consecutive samples of a log that are tested as one run.
 
@@ -119,10 +119,10 @@ class Stretch:
     why: str = ""
     channel: str = ""
     size: float = 0.0
-    mean: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    sd: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    drift: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    glitches: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    mean: Mapping[str, float] = field(default_factory=dict)
+    sd: Mapping[str, float] = field(default_factory=dict)
+    drift: Mapping[str, float] = field(default_factory=dict)
+    glitches: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def lasts(self) -> float:
@@ -130,7 +130,7 @@ class Stretch:
         return self.end - self.begin
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Settled:
     """Settled travel of a log.
 
@@ -166,7 +166,7 @@ class Settled:
         """Settled runs, in the form of a table from a file."""
         columns = self.table()
         extras = {name: columns.pop(name) for name in self.runs.extras if name in columns}
-        return dataclasses.replace(self.runs, columns=columns, extras=extras, log=None)
+        return replace(self.runs, columns=columns, extras=extras, log=None)
 
     def table(self) -> Columns:
         """Settled runs as columns of a table of runs."""
@@ -229,10 +229,10 @@ def settle_log(
         raise BadData(doubt)
     if robot is not None and not runs.turns:  # the sides of a turn have different speeds
         _check_units(result, rolling_readings(robot))
-    return dataclasses.replace(
+    return replace(
         result,
         stretches=tuple(
-            dataclasses.replace(s, sd={name: math.hypot(sd, result.scatter[name]) for name, sd in s.sd.items()})
+            replace(s, sd={name: math.hypot(sd, result.scatter[name]) for name, sd in s.sd.items()})
             for s in result.stretches
         ),
     )
@@ -296,7 +296,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
                 raise time_goes_back(runs, *rows[k : k + 2])
             raise BadData(
                 f"{runs.place(rows[k + 1])}, time_s: {time[rows[k]]:g} s is repeated; give each sample its "
-                "own time, with more digits if available, or remove one of them"
+                "own time, or remove one of them"
             )
     if max(map(len, rows_by_run)) < FEWEST:
         raise BadData(
@@ -487,7 +487,7 @@ def _settled_end(
     level = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
 
     def out(why: str, channel: str = "", size: float = 0.0) -> Stretch:
-        return dataclasses.replace(level, why=why, channel=channel, size=size)
+        return replace(level, why=why, channel=channel, size=size)
 
     if runs.has("mode") and str(runs["mode"][rows[0]]) != "voltage":
         return out("undriven")
@@ -533,7 +533,7 @@ def _settled_end(
     mean, sd, change = means.T
     # The tail of a lag would continue by about as much again after the end, in all channels.
     sd = np.hypot(sd, left_over * _scales(signals, mean))
-    return dataclasses.replace(
+    return replace(
         level,
         rows=end_rows,
         begin=float(time[end_rows[0]]),
@@ -831,14 +831,11 @@ def _nothing_settled_message(found: Settled) -> str:
     imposed = found.runs.layout.imposed_column
     message_of_reason = {
         "idle": (
-            f"{imposed} is about zero, so nothing drives the motors. Log driven rows, or name the column of the "
-            "command under [columns]"
+            f"{imposed} is about zero, so nothing drives the motors. Log driven rows, or name the command "
+            "under [columns]"
         ),
         "rest": "no level shows motion above the noise. Use larger commands",
-        "stuck": (
-            f"{longest.channel} shows one number for a long time: saturated or frozen. Repair the instrument or "
-            "change its range"
-        ),
+        "stuck": (f"{longest.channel} shows one number for a long time. Repair the instrument or change its range"),
         "glitches": f"{longest.channel} has many outlying readings. Repair the instrument, or log its mean",
         "undriven": "the driver brakes or coasts in every row. Log driven rows",
     }

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -66,7 +66,7 @@ def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
     return side_drives * np.where(np.isnan(supply), 1.0, supply)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Runs:
     """Table of runs with one row for each run, or for each sample if it has `time_s`.
 
@@ -88,10 +88,10 @@ class Runs:
     columns: Columns
     unknown: Names = ()
     digest: str = ""
-    extras: Columns = dataclasses.field(default_factory=dict)
-    layout: Layout = dataclasses.field(default_factory=Layout)
+    extras: Columns = field(default_factory=dict)
+    layout: Layout = field(default_factory=Layout)
     notes: Names = ()
-    headings: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    headings: Mapping[str, str] = field(default_factory=dict)
     log: Runs | None = None
 
     def __len__(self) -> int:
@@ -145,12 +145,12 @@ class Runs:
         own_columns |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
         other_columns = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - own_columns
         remaining_columns = {name: values for name, values in self.columns.items() if name in other_columns}
-        return dataclasses.replace(
+        return replace(
             self,
             columns={name: values for name, values in self.columns.items() if name not in remaining_columns},
             unknown=(*self.unknown, *remaining_columns),
             extras={**self.extras, **remaining_columns},
-            layout=dataclasses.replace(self.layout, channels=robot.channels),
+            layout=replace(self.layout, channels=robot.channels),
         )
 
     @property
@@ -208,7 +208,7 @@ class Runs:
     def where(self, rows: np.ndarray) -> Runs:
         """Table with the rows that a mask or an index selects."""
         columns, extras = ({k: v[rows] for k, v in cells.items()} for cells in (self.columns, self.extras))
-        return dataclasses.replace(self, columns=columns, extras=extras)
+        return replace(self, columns=columns, extras=extras)
 
     def measured(self) -> np.ndarray:
         """Measured readings [SI], NaN if missing, shape (rows, channels)."""

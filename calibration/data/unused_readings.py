@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -50,7 +50,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
             continue
         computed = (
             f"{runs.source}, {torque}: equals {line[1]:.4g} times {current} in every row, to the last digit, so it "
-            "was computed, not measured, and does not show torque constant, friction or efficiency"
+            "was computed, not measured"
         )
         if torque == TORQUE:
             columns.pop(torque)
@@ -61,9 +61,9 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
             columns[torque] = _load_for_current(runs, robot, shown[current], columns.pop(current))
             notes.append(
                 f"{computed}. It is left out. The load follows from {current} and the robot's file, so this "
-                "current is no reading either. Only voltages and speeds are used"
+                "current is no reading either"
             )
-    return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
+    return replace(runs, columns=columns, notes=tuple(notes))
 
 
 def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.ndarray:
@@ -78,9 +78,7 @@ def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarra
     many = float(robot.sides) if channel == "total_current" else 1.0
     rise = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant) / many
     for _ in range(SEARCH):
-        drawn = np.asarray(
-            simulate(robot, dataclasses.replace(conditions, load_torque=jnp.asarray(load))).reading[channel]
-        )
+        drawn = np.asarray(simulate(robot, replace(conditions, load_torque=jnp.asarray(load))).reading[channel])
         current_error = np.where(np.isfinite(current), current - drawn, 0.0)
         load = load + rise * np.nan_to_num(current_error)
     bad = np.flatnonzero(~(np.abs(current_error) <= ERROR * np.nanmax(np.abs(current))))
@@ -141,7 +139,7 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
             f"{runs.source}, {rows}: readings no longer change while the command rises: supply or driver is at a "
             "limit. These rows are set aside"
         )
-    return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
+    return replace(runs, columns=columns, notes=tuple(notes))
 
 
 def _turning_mask(runs: Runs, robot: Robot, drive: np.ndarray) -> np.ndarray:
@@ -228,7 +226,7 @@ def without_held(runs: Runs) -> Runs:
                 f"{runs.place(held[0], held[-1])}, {runs.heading(column)}: the same "
                 f"reading while {drive_heading(runs)} changes, like repeats. {cure}"
             )
-    return dataclasses.replace(runs, columns=columns, notes=(*runs.notes, *notes.values()))
+    return replace(runs, columns=columns, notes=(*runs.notes, *notes.values()))
 
 
 #: Number of rows at the start of a run that are always used, because they show its initial state.
@@ -279,7 +277,7 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
     else:
         ordered = [np.lexsort([runs[column] for column in reversed(("configuration", *runs.axes))])]
     kept_rows = np.concatenate([rows[_evenly_spaced_rows(read[rows], apart)] for rows in ordered])
-    return dataclasses.replace(runs.where(np.sort(kept_rows)), log=runs.whole)
+    return replace(runs.where(np.sort(kept_rows)), log=runs.whole)
 
 
 def _evenly_spaced_rows(read: np.ndarray, apart: int) -> np.ndarray:

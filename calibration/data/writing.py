@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import dataclasses
 import inspect
 import io
 import json
@@ -13,6 +12,7 @@ import operator
 import re
 import shutil
 from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TextIO, TypeAlias
 
@@ -250,8 +250,8 @@ def json_value(value: Any) -> Any:
     json_fields = getattr(value, "JSON", None)
     if json_fields is None and hasattr(value, "to_json"):
         return json_value(value.to_json())
-    if json_fields is None and dataclasses.is_dataclass(value):
-        json_fields = [field.name for field in dataclasses.fields(value)]
+    if json_fields is None and is_dataclass(value):
+        json_fields = [field.name for field in fields(value)]
     if json_fields is not None:
         return json_value(entries_of(value, *json_fields))
     if isinstance(value, Mapping):

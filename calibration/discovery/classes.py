@@ -158,7 +158,7 @@ def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ..
     names, effect_of = space.library.names, space.library.of
     # Largest |cos| between the projected signatures of every two effects, over their shapes.
     cosine = np.zeros((len(names), len(names)))
-    np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(np.asarray(left.scores.cosine)))
+    np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(left.scores.cosine))
     one = len(best.effects) == 1
     fewer = [beside.base] if one else refit_without_each(space, best, settings, ladder)
     rivals: dict[tuple[str, str], Names] = {}

@@ -266,7 +266,7 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
         lambda x: np.asarray(x)[: len(names)], _predict_alternatives(equipped, other, batch, active, z, informed)
     )
     experiments, possible = _possible_experiments(menu_experiments, predictions, settings)
-    medians = np.median(np.asarray(space.equipped.data.sd), 0)
+    medians = np.median(space.equipped.data.sd, 0)
     sd = predicted.reading_sds(experiments, dict(zip(shown, medians, strict=True)))
     value, half = (np.nan_to_num(x[:, possible]) for x in (predictions.value, half))
     exists = np.all(predictions.exists[:, possible], 0)

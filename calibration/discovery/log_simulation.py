@@ -17,7 +17,7 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit
 from calibration.discovery.settings import Settings
 from calibration.inference.blocks import fit_from_each_start
-from calibration.inference.noise_factor import variance_of_sums
+from calibration.inference.lack_of_fit import variance_of_sums
 from calibration.inference.observers.time_histories import HistoriesLinearization
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import channels

@@ -260,9 +260,9 @@ def _isolated_rows(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int
     """Indices of at most `allowed` rows with one reading whose shift is more significant than any effect or curve."""
     included = base.space.included
     level = -ndtri(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
-    alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
+    alone = (np.abs(scores.row) * included[:, None]).max(1)
     smooth = [variable not in bases_room.ORDERS for _, variable in bases_room.family_names(bases)]
-    together = max(np.max(np.abs(np.asarray(scores.single))), np.max(np.asarray(scores.curve)[smooth]))
+    together = max(np.max(np.abs(scores.single)), np.max(np.asarray(scores.curve)[smooth]))
     count = 1 if base.space.bare.observe.policy.one_by_one else allowed
     far = np.argsort(-alone)[: min(count, max(allowed, 0))]
     return far[(alone[far] >= level) & (alone[far] >= together)]
@@ -315,7 +315,7 @@ def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:
     problem = problem if active is None else base.space.problem(base.candidate.active)
     index, _ = problem.observe.padded_rows(len(runs))
     columns = dict(runs.where(index).columns)
-    reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
+    reading = np.where(np.isfinite(base.reading), base.reading, problem.data.measured)
     columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
     observe = problem.observe.at_fit(problem, z)
     return observe.bases(columns, base.space.included, problem.robot(jnp.asarray(z)))

@@ -75,7 +75,7 @@ def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> Experi
     runs = [e for e in experiments if isinstance(e, ProposedRuns)]
     set_up = list(dict.fromkeys((r.setup, r.sides) for r in runs))
     several = [(r, len(r.voltage)) for r in runs]
-    run_conditions = [jax.tree.map(lambda x: np.atleast_1d(np.asarray(x)), _conditions_of_runs(r)) for r in runs]
+    run_conditions = [jax.tree.map(lambda x: np.atleast_1d(x), _conditions_of_runs(r)) for r in runs]
     return ExperimentBatch(
         acts=tuple(a.reading for a in acts),
         at=tuple(jnp.asarray(a.at, float) for a in acts),

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
-from calibration.inference.operating import operating_readings
+from calibration.inference.ranges import operating_readings
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
@@ -143,8 +143,8 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
         motor_speed, speed, geared, free_speed, motors, resistance, constant, motor.temperature_limit,
         robot.rig.imposed,
         _levels(np.asarray(getattr(conditions, robot.rig.imposed))) if conditions.voltage_follows else (),
-        robot.has_ground, _levels(np.abs(np.asarray(conditions.duty))),
-        () if conditions.load_torque is None else _levels(np.abs(np.asarray(conditions.load_torque))),
+        robot.has_ground, _levels(np.abs(conditions.duty)),
+        () if conditions.load_torque is None else _levels(np.abs(conditions.load_torque)),
     )  # fmt: skip
 
 

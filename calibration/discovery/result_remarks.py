@@ -16,9 +16,8 @@ from calibration.inference import priors, series_noise
 from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Notes, Remark
 from calibration.inference.identifiability import undetermined_names
-from calibration.inference.lack_of_fit import Residuals
+from calibration.inference.lack_of_fit import Residuals, noise_remarks
 from calibration.inference.noise import Noise
-from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.weak_form import TENTH
 
 #: Size of a delay in its sds from which a note reports it, and as a share of the longest in the equations.

@@ -28,7 +28,7 @@ from calibration.data.effect_file import Library
 from calibration.data.runs import Runs
 from calibration.discovery.reach import LOADED, RUNNING
 from calibration.inference import observers
-from calibration.inference.operating import travel_of_rows
+from calibration.inference.ranges import travel_of_rows
 from mmrjax.effects import Effect
 from mmrjax.effects.base import amplitude_of, free_shape_parameter, scaled_effect
 from mmrjax.model import channels, paper_robots, params
@@ -210,7 +210,7 @@ def _scale_to_rated_load(robot: Robot, signals: Signals) -> Signals:
     That load is at the continuous current, or at a share of the stall current if resistance and voltage are known.
     """
     motor, rig = robot.motor, robot.rig
-    largest = lambda x: float(np.nanmax(np.abs(np.asarray(x)), initial=0.0))  # noqa: E731
+    largest = lambda x: float(np.nanmax(np.abs(x), initial=0.0))  # noqa: E731
     current, speed, volts = largest(signals.current), largest(signals.speed_motor), largest(signals.voltage)
     if not (rig.shows_voltage and current and speed and volts and float(motor.resistance)):
         return signals

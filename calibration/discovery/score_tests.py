@@ -274,10 +274,10 @@ def statistics_with_columns(
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
     scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
     balances = np.array([n[0] for b in bases for n in b.names])
-    deviate = np.where(np.isin(balances, list(names)), -np.inf, np.asarray(scores.curve))
+    deviate = np.where(np.isin(balances, list(names)), -np.inf, scores.curve)
     nothing = jnp.asarray(-jnp.inf)
     statistics = StrongestStatistics(
-        single=np.max(np.abs(np.asarray(scores.single))),
+        single=np.max(np.abs(scores.single)),
         pair=np.max(np.asarray(scores.pair)),
         curve=np.max(deviate, initial=-np.inf),
         chi2=nothing,

@@ -154,7 +154,7 @@ def refit_without_each(
 
 def _names_by_score(space: CandidateSpace, scores: ScoreTable, last: Sequence[str] = ()) -> list[str]:
     """Names of effects by their best |score|, strongest first. Effects in `last` come last."""
-    strength = space.library.largest(np.abs(np.asarray(scores.single)))
+    strength = space.library.largest(np.abs(scores.single))
     strength[np.isin(space.library.names, last)] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
 
@@ -175,7 +175,7 @@ def _extend_set(
     names = _names_by_score(space, left_by_best.scores, best.effects)[: _batch_size(space)]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
-        pair_scores = np.triu(np.asarray(left.scores.pair))
+        pair_scores = np.triu(left.scores.pair)
         strongest = np.unravel_index(np.argsort(-pair_scores, axis=None)[:PAIRS], pair_scores.shape)
         pairs = dict.fromkeys(tuple(sorted(pair)) for pair in space.library.of[np.stack(strongest, 1)].tolist())
         for i, j in itertools.islice((pair for pair in pairs if pair[0] != pair[1]), _batch_size(space)):

@@ -30,8 +30,8 @@ from calibration.discovery.search import Proposed, SearchResult
 from calibration.discovery.settings import HELD_OUT
 from calibration.discovery.verdict import VerdictNoise
 from calibration.inference.fit_notes import progress_remark
+from calibration.inference.lack_of_fit import common_factors, noise_remarks
 from calibration.inference.noise import Noise
-from calibration.inference.noise_factor import common_factors, noise_remarks
 
 #: Number of times that rows are screened for isolated outliers, with the effects found.
 SCREENINGS = 4
@@ -122,7 +122,7 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
         if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
         else known_stages.left.test.null
     )
-    if np.max(np.abs(np.asarray(screened.diagnosed[1].single))) > LIKELY:
+    if np.max(np.abs(screened.diagnosed[1].single)) > LIKELY:
         while given.later:
             given.later.pop()(screened.base)
     return screened, outliers.diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)

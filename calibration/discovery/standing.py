@@ -324,7 +324,7 @@ def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -
         return set()
     lacks = {equation_of_place(locate_discrepancy(seen, bases, space.included).place)}
     if seen.test.exceeds_margin("single"):
-        strongest = space.library.of[int(np.argmax(np.abs(np.asarray(seen.scores.single))))]
+        strongest = space.library.of[int(np.argmax(np.abs(seen.scores.single)))]
         lacks.add(_equation_of_effect(space, space.library.names[strongest]))
     return lacks
 

@@ -32,8 +32,8 @@ from calibration.inference import (
 from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Remark, progress_remark, remarks_with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
+from calibration.inference.lack_of_fit import noise_remarks
 from calibration.inference.multistart import MultistartResult
-from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.population import EDGE, GENERATIONS, LEAST, StoreStage, compute_without_storing
 from calibration.inference.preparation import PreparedInput, prepare_input, rows_to_fit
 from calibration.inference.problem import MARGIN, Problem
@@ -350,7 +350,7 @@ def _calibration_result(
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
-    scanned = {k: scans.scan_coordinate(posed, z, k) for k in scans.scanned_coordinates(posed)}
+    scanned = {k: scans.scan_coordinate(posed, z, k) for k in posed.observe.scanned(posed)}
     sd = about.sd.copy()
     for k, scan in scanned.items():
         sd[k] = scan.sd()

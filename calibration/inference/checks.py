@@ -21,8 +21,7 @@ from calibration.inference.conduct import conduct_notes
 from calibration.inference.fit_notes import Remark
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
-from calibration.inference.operating import operating_readings
-from calibration.inference.ranges import check_ranges
+from calibration.inference.ranges import check_ranges, operating_readings
 from calibration.inference.residual_clusters import TIMES
 from mmrjax.errors import count_noun
 from mmrjax.model import channels

@@ -9,8 +9,7 @@ from calibration.data.clock import applied_drive, rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.fit_notes import Remark
-from calibration.inference.operating import operating_readings
-from calibration.inference.ranges import UNDER_WAY
+from calibration.inference.ranges import UNDER_WAY, operating_readings
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
@@ -47,8 +46,7 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
     notes, both = [], rows_after_steps(runs)
     for k, channel in enumerate(runs.channels):
         squares = np.nan_to_num(off[:, k]) ** 2
-        sums = {rows.tobytes(): (float(squares[rows].sum()), int(rows.sum())) for rows in both}
-        largest_sum, count = max(sums.values())
+        largest_sum, count = max((float(squares[rows].sum()), int(rows.sum())) for rows in both)
         if 0 < count <= FEW_ROWS * len(runs) and largest_sum >= MOST_ERROR * squares.sum() > 0:
             notes.append(
                 Remark(
@@ -97,17 +95,12 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:
     slow = measured & np.isfinite(steady) & (speed < SLOW * steady)
     early = (lasts < UNDER_WAY) & (slow | ~measured)
     is_sliding = (lasts >= UNDER_WAY) & measured & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
-    is_sliding &= ~np.isin(
-        names, runs.run_names[rows_of_varying_runs(runs)]
-    )  # their settled ends are only parts of them
+    # Settled ends of runs that vary are only parts of them.
+    is_sliding &= ~np.isin(names, runs.run_names[rows_of_varying_runs(runs)])
     remarks: list[Remark] = []
     if early.any():
-        slow_and_early = slow & early
-        share = (
-            float(np.nanmedian(speed[slow_and_early] / steady[slow_and_early]))
-            if slow_and_early.any()
-            else float("nan")
-        )
+        shares = speed[slow & early] / steady[slow & early]
+        share = float(np.nanmedian(shares)) if len(shares) else float("nan")
         remarks.append(
             Remark("ends_early", runs=_run_names(names, early), lasts=float(lasts[early].max()), share=share)
         )

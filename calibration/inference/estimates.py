@@ -113,15 +113,13 @@ def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np
 
 
 def errors_by_channel(
-    shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
+    shown: Sequence[Channel],
+    simulated: np.ndarray,
+    measured: np.ndarray,
+    sd: np.ndarray,
+    percent: np.ndarray | None = None,
 ) -> Errors:
-    """Errors of each channel. Arguments have shape (rows, channels)."""
-    return _channel_errors(shown, simulated, measured, sd, sized_error(simulated, measured))
-
-
-def _channel_errors(
-    shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
-) -> Errors:
+    """Errors of each channel. Arguments as in `simulation_errors.channel_errors`."""
     errors = simulation_errors.channel_errors(shown, simulated, measured, sd, percent)
     return {name: result.ChannelErrors(**e) for name, e in errors.items()}
 
@@ -134,13 +132,13 @@ def hold_out_errors(posed: Problem, held: HeldOutFits, measured: np.ndarray, sd:
         is_in_block = held.block == k
         of_block, percent_of_block = (np.where(is_in_block[:, None], x, np.nan) for x in (held.reading, percent))
         blocks[label] = result.BlockErrors(
-            _channel_errors(posed.channels, of_block, measured, sd, percent_of_block),
+            errors_by_channel(posed.channels, of_block, measured, sd, percent_of_block),
             row_numbers(is_in_block & unreachable),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
     return HeldOutErrors(
-        _channel_errors(posed.channels, held.reading, measured, sd, percent),
+        errors_by_channel(posed.channels, held.reading, measured, sd, percent),
         row_numbers(unreachable),
         blocks,
         reading,

@@ -99,16 +99,13 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
         if k in channel_sizes:
             raise BadConfiguration(f"--noise {part.strip()}: {name} is given twice; expected each channel once")
         channel = shown[k]
-        match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
+        match = re.fullmatch(r"\s*(\+?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(%|[^\d\s.]+)\s*", value)
         sizes = channel.sizes
         form = (
             f"expected a positive number with % or {' or '.join(sizes)}, e.g. {name}=2% or {name}=0.1{channel.unit}"
         )
-        try:
-            size = float(match[1]) if match else math.nan
-        except ValueError:
-            size = math.nan
-        if match is None or not size > 0 or math.isinf(size) or match[2] not in ("%", *sizes):
+        size = float(match[1]) if match else math.nan
+        if match is None or not 0 < size < math.inf or match[2] not in ("%", *sizes):
             raise BadConfiguration(f"--noise {part.strip()}: {form}")
         relative = match[2] == "%"
         channel_sizes[k] = (size / 100 if relative else size * sizes[match[2]], relative)

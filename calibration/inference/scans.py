@@ -85,11 +85,6 @@ class Scan:
         return float(np.sqrt(np.sum(mass * (self.at - middle) ** 2) / np.sum(mass)))
 
 
-def scanned_coordinates(problem: Problem) -> tuple[int, ...]:
-    """Indices of the coordinates that are scanned: those whose fields request it, if the data are histories."""
-    return problem.observe.scanned(problem)
-
-
 def wide_coordinates(problem: Problem) -> tuple[int, ...]:
     """Indices of the coordinates whose prior is wider than one local minimum of the misfit, according to their fields
     (`Spec.scanned`).
@@ -140,7 +135,7 @@ def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) ->
     unchanged.
     """
     starts = np.array(starts, float)
-    for k in scanned_coordinates(problem):
+    for k in problem.observe.scanned(problem):
         scan = scan_coordinate(problem, starts[0], k)
         starts[:, k] = scan.at[np.argmin(scan.cost)]
     return starts
@@ -161,7 +156,7 @@ def search_lower_minima(
         found: optimum of a search, and the observation there.
         search: function that searches from a start.
     """
-    coordinates = scanned_coordinates(problem)
+    coordinates = problem.observe.scanned(problem)
     if not coordinates:
         return found
 

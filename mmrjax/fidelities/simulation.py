@@ -283,7 +283,8 @@ def _check_conditions(conditions: Conditions) -> None:
         (low, high), unit = condition.range, condition.unit_shown
         if id(value) not in ends:
             ends[id(value)] = _smallest_and_largest(value)
-        if not _all_within(ends[id(value)], low, high) and (wrong := _first_outside(value, low, high)):
+        least, most = ends[id(value)]
+        if not low <= least <= most <= high and (wrong := _first_outside(value, low, high)):
             raise UsageError(
                 f"{field.name}{wrong[0]}: got {wrong[1]:.6g}; expected {low:g} to {high:g} {unit}".rstrip()
             )
@@ -304,11 +305,6 @@ def _smallest_and_largest(values: jax.Array | np.ndarray) -> tuple[float, float]
     numbers = np.asarray(values) if on_host else values
     least, most = jax.device_get((numbers.min(), numbers.max()))
     return float(least), float(most)
-
-
-def _all_within(ends: tuple[float, float], low: float, high: float) -> bool:
-    """True if every number is finite and within the limits."""
-    return low <= ends[0] and ends[1] <= high and math.isfinite(ends[0]) and math.isfinite(ends[1])
 
 
 def _first_outside(value: Any, low: float, high: float) -> tuple[str, float] | None:

@@ -37,7 +37,7 @@ class Chassis(eqx.Module):
     )  # fmt: skip
     radius: Scalar = parameter(
         None, "m", "rolling radius of driving pulley or wheel r_k", (1e-3, 2.0),
-        "48 teeth of 5 mm (6T2A; Table 6 prints the diameter over the grousers); D_w/2, Table 6 (4W2T)",
+        "48 teeth of 5 mm (6T2A); D_w/2, Table 6 (4W2T)",
         relative_sd=0.005,
     )  # fmt: skip
     inertia: Scalar = parameter(

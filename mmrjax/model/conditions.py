@@ -183,11 +183,8 @@ class Conditions(eqx.Module):
         if not isinstance(configuration, jax.Array | NamedConfigurations):
             words = np.asarray(configuration)
             configurations = NamedConfigurations.of(words) if words.dtype.kind == "U" else configuration
-        configurations = (
-            configurations
-            if isinstance(configurations, NamedConfigurations)
-            else _number_array("configuration", configurations, int)
-        )
+        if not isinstance(configurations, NamedConfigurations):
+            configurations = _number_array("configuration", configurations, int)
         numbers = {name: _number_array(name, x) for name, x in condition_values.items()}
         shapes = {name: x.shape for name, x in {"configuration": configurations, **numbers}.items()}
         try:

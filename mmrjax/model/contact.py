@@ -12,8 +12,8 @@ from mmrjax.model.params import Scalar, parameter
 from mmrjax.model.signals import safe_quotient
 from mmrjax.numerics.elementary import sine, sine_third
 
-_SLIPS = "Tables A1, A2 simulated: slip at 5 and 10 deg implies 9-39 mm/s with the adhesion of Table 5"
-_PACKAGE = "10 V_s, as in the multibody package of ref. [48]. The paper prints none"
+_SLIPS = "Tables A1, A2 simulated: slip at 5 and 10 deg implies 9-39 mm/s"
+_PACKAGE = "10 V_s, as in the multibody package of ref. [48]"
 
 
 def cubic_step(x: Scalar, x0: Scalar, y0: Scalar, x1: Scalar, y1: Scalar) -> Scalar:
@@ -43,7 +43,7 @@ class Friction(eqx.Module):
         "Table 5, φ_x on lacquered wood (surface of the bench)", relative_sd=0.3,
     )  # fmt: skip
     dynamic: Scalar = parameter(
-        None, "-", "dynamic coefficient μ_d", (0.005, 3.0), "assumed 0.8 of μ_s. The paper prints none",
+        None, "-", "dynamic coefficient μ_d", (0.005, 3.0), "assumed: 0.8 of μ_s",
         relative_sd=0.3,
     )  # fmt: skip
     speed_static: Scalar = parameter(
@@ -154,7 +154,7 @@ class Track(eqx.Module):
     )
     guide_share: Scalar = parameter(
         None, "-", "share of the weight that the guides carry (the pulleys carry the rest)", (0.0, 1.0),
-        "Table A1 simulated lies between 0 and 1 of the weight; wheels carry all of it in 4W2T", sd=0.2,
+        "Table A1 simulated: between 0 and 1 of the weight; wheels carry all of it", sd=0.2,
     )  # fmt: skip
 
     def torque_loss(self, speed_wheel: Scalar, direction: Scalar) -> Scalar:

@@ -45,15 +45,15 @@ class Driver(eqx.Module):
 
     current_limit: Scalar = parameter(
         1000.0, "A", "largest current of one motor that the driver permits", (0.01, 1e4),
-        "no limit on the bench: above any current", relative_sd=0.1,
+        "no limit on the bench", relative_sd=0.1,
     )  # fmt: skip
     gain: Scalar = parameter(
         4.0, "-", "proportional gain of the speed controller over the speed constant C_E", (0.0, 1e3),
-        "assumed; the paper has no controller", relative_sd=0.1,
+        "assumed", relative_sd=0.1,
     )  # fmt: skip
     time_reset: Scalar = parameter(
         0.05, "s", "reset time of the speed controller",
-        (1e-3, 1e3), "assumed; the paper has no controller", relative_sd=0.1,
+        (1e-3, 1e3), "assumed", relative_sd=0.1,
     )  # fmt: skip
     returns_current: bool = eqx.field(default=True, static=True)
     decay: str = eqx.field(default=SLOW, static=True)

@@ -117,7 +117,7 @@ def rig_spec(spec: Spec, stated: bool) -> Spec:
     return dataclasses.replace(spec, meaning=_OF_PAPER.sub("", spec.meaning), source=source)
 
 
-def walk_parameters(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
+def walk_parameters(component: eqx.Module) -> Iterator[Parameter]:
     """Yields every parameter below `component`, depth first, by dotted name.
 
     Parameters of a rig without a base robot do not mention the paper (`rig_spec`). A tuple of modules (the effects)
@@ -125,10 +125,10 @@ def walk_parameters(component: eqx.Module, prefix: str = "") -> Iterator[Paramet
     """
     rig = getattr(component, "rig", None)
     if rig is None or rig.inherits:
-        yield from _walk_component(component, prefix)
+        yield from _walk_component(component, "")
         return
     prior_names = {name for name, _, _ in rig.priors}
-    for parameter in _walk_component(component, prefix):
+    for parameter in _walk_component(component, ""):
         spec = rig_spec(parameter.spec, parameter.name in prior_names)
         yield dataclasses.replace(parameter, spec=spec)
 

@@ -26,8 +26,8 @@ from sweeps.report import comparison_report
 from sweeps.report.comparison_report import Comparison, compare_readings
 from sweeps.store import RunFolder, open_folder, print_report
 
-#: Fidelity for time histories, and further axes over which their errors are shown.
-HISTORIES, OVER = "drive", {"time_s": "time [s]"}
+#: Fidelity for time histories.
+HISTORIES = "drive"
 
 
 def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -> int:
@@ -65,7 +65,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     with open_folder("compare", config, robot, beside, runs) as folder:
         table = simulated(robot, folder)
         comparison, summary = compare_readings(measured_runs, table, robot)
-        comparison |= {column: runs[column] for column in (*OVER, "run_id") if runs.sampled and runs.has(column)}
+        comparison |= {column: runs[column] for column in ("time_s", "run_id") if runs.sampled and runs.has(column)}
         if other is not None:
             readings = simulated(other, None)
             comparison |= {f"against_{c.column}": readings[c.column] for c in runs.channels}
@@ -91,7 +91,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
             against = str(config.against) if against == name else against
         compared = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES if runs.sampled else config.model,
-            name, recorded_fit(file, runs), OVER if runs.sampled else None, (*notes, *of_draws), against, after_steps,
+            name, recorded_fit(file, runs), (*notes, *of_draws), against, runs.sampled, after_steps,
         )  # fmt: skip
         document = print_report(
             comparison_report.comparison_document(compared), dataclasses.replace(file, robot=robot)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,64 +24,46 @@ from sweeps.pages.figure_style import (
     configuration_looks,
     new_figure,
 )
+from sweeps.report.run_tables import axis_title
+
+#: Columns over which errors are drawn if they vary and are not simulated.
+_CONDITIONS = (
+    "slope_deg", "supply_voltage_V", "motor_speed_rpm", "motor_current_A", "goal_angle_deg", "goal_speed_rpm",
+    "goal_current_A", "payload_kg", "load_torque_Nm",
+)  # fmt: skip
 
 
-def draw_errors_over_conditions(
-    table: Columns,
-    channels: Sequence[Channel],
-    beside: Mapping[str, str] | None = None,
-) -> Figure:
+def draw_errors_over_conditions(table: Columns, channels: Sequence[Channel]) -> Figure:
     """Simulated minus measured for each channel over each condition that varies, or over the row number.
 
     A band shows two standard deviations of the readings if they are known.
-
-    Args:
-        beside: columns in addition to conditions, with their headings.
     """
-    errors_by_condition = {
-        "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
-        "motor_current_A": "motor current [A]", "payload_kg": "payload [kg]",
-    }  # fmt: skip
-    conditions = {
-        c: words for c, words in errors_by_condition.items() if c in table and f"simulated_{c}" not in table
-    }
-    conditions |= beside or {}
-    varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
-    conditions = varied or dict(list(conditions.items())[:1])
-    if not conditions:
-        conditions, table = {"row": "row"}, {**table, "row": np.arange(1.0, len(table["configuration"]) + 1)}
+    imposed = [c for c in _CONDITIONS if c in table and f"simulated_{c}" not in table]
+    conditions = {axis_title(c): table[c] for c in imposed if np.unique(table[c]).size > 1}
+    conditions = conditions or {"row": np.arange(1.0, len(table["configuration"]) + 1)}
     fig, grid = new_figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
     look = configuration_looks(table["configuration"])
     for row, channel in zip(grid, channels, strict=True):
         error = table[f"simulated_{channel.column}"] - table[channel.column]
         sd = table.get(channel.sd_column, np.array([np.nan]))
         half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
-        for axes, (condition, words) in zip(row, conditions.items(), strict=True):
+        for axes, (label, x) in zip(row, conditions.items(), strict=True):
             axes.axhspan(-half, half, color="#eef3ee", zorder=0)
             axes.axhline(0, color="#666666", lw=0.9)
-            levels = np.unique(table[condition])
-            shift = 0.012 * max(1e-9, float(np.ptp(levels))) if levels.size > 1 else 0.02
-            sides = np.linspace(-1, 1, len(look)) if len(look) > 1 else (0.0,)
-            for side, (kind, (colour, marker)) in zip(sides, look.items(), strict=True):
+            shifts = 0.012 * np.ptp(x) * (np.linspace(-1, 1, len(look)) if len(look) > 1 else np.zeros(1))
+            for shift, (kind, (colour, marker)) in zip(shifts, look.items(), strict=True):
                 pick = (table["configuration"] == kind) & np.isfinite(error)
                 if pick.any():
-                    shifted = table[condition][pick] + side * shift
-                    _draw_dots(axes, shifted, error[pick], marker, color=colour, label=kind)
+                    axes.plot(x[pick] + shift, error[pick], marker, ms=5, mec="white", mew=0.5, color=colour,
+                              label=kind, rasterized=np.count_nonzero(pick) > 500)  # fmt: skip
             if row[0] is grid[-1, 0]:
-                axes.set_xlabel(words)
-                if levels.size <= 8:
-                    axes.set_xticks(levels)
+                axes.set_xlabel(label)
+                if np.unique(x).size <= 8:
+                    axes.set_xticks(np.unique(x))
         row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit}]")
-    for axes in grid[0]:
-        if axes.get_legend_handles_labels()[0] and len(look) <= LOOKS:
-            axes.legend(loc="best")
-            break
+    if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
+        grid[0, 0].legend(loc="best")
     return fig
-
-
-def _draw_dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
-    """Readings of a configuration as dots, rasterised if there are many."""
-    axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 500, **look)
 
 
 def quasistatic(found: Feedforward) -> Figure:
@@ -111,12 +92,10 @@ def dynamic(found: Feedforward) -> Figure:
 
 
 def _points(x: np.ndarray, y: np.ndarray, along: str, up: str) -> tuple[Figure, Axes]:
-    fig, grid = new_figure(1, 1, 3.2)
-    axes = grid[0, 0]
+    fig, ((axes,),) = new_figure(1, 1, 3.2)
     axes.axhline(0, color=INK, lw=0.6)
     axes.plot(x, y, ".", ms=4, color=BLUE)
-    axes.set_xlabel(along)
-    axes.set_ylabel(up)
+    axes.set(xlabel=along, ylabel=up)
     return fig, axes
 
 
@@ -147,12 +126,12 @@ class TimeOverlay:
         return max(self.rows, key=lambda name: np.nan_to_num(self._misfit(self.rows[name])))
 
     def _misfit(self, rows: np.ndarray) -> float:
-        shares = []
+        shares = [np.nan]
         for channel in self.channels:
-            measured = self.table[channel.column]
-            size = np.sqrt(np.nanmean(np.square(measured))) if np.isfinite(measured).any() else np.nan
-            shares.append(np.nanmean(np.square(self._residual(channel)[rows]) / size**2) if size > 0 else np.nan)
-        return float(np.nanmean(shares)) if np.isfinite(shares).any() else float("nan")
+            size = float(np.nanmean(np.square(self.table[channel.column])))
+            if size > 0:
+                shares.append(np.nanmean(np.square(self._residual(channel)[rows])) / size)
+        return float(np.nanmean(shares)) if np.isfinite(shares).any() else np.nan
 
     def _residual(self, channel: Channel) -> np.ndarray:
         first_prefix = next(iter(self.simulated))
@@ -160,28 +139,19 @@ class TimeOverlay:
 
     def draw(self) -> Figure:
         """Figure of the worst run: for each channel the readings, and below them simulated minus measured."""
-        name = self.worst
-        rows = self._thinned(self.rows[name], POINTS // (4 * len(self.channels)))
+        name, count = self.worst, len(self.channels)
+        rows = self._thinned(self.rows[name], POINTS // (4 * count))
         time = self.table["time_s"][rows]
-        count = len(self.channels)
         fig, grid = new_figure(2 * count, 1, 2.9 * count, sharex=True, height_ratios=[3, 1] * count)
-        for k, channel in enumerate(self.channels):
-            reading_axes, residual_axes = grid[2 * k, 0], grid[2 * k + 1, 0]
-            reading_axes.plot(
-                time,
-                self.table[channel.column][rows],
-                ".",
-                ms=3,
-                color=INK,
-                label="measured",
-                rasterized=len(rows) > 500,
-            )
+        for readings, residual, channel in zip(grid[::2, 0], grid[1::2, 0], self.channels, strict=True):
+            measured = self.table[channel.column][rows]
+            readings.plot(time, measured, ".", ms=3, color=INK, label="measured", rasterized=len(rows) > 500)
             for (prefix, words), colour in zip(self.simulated.items(), COLOURS, strict=False):
-                reading_axes.plot(time, self.table[prefix + channel.column][rows], color=colour, lw=1.3, label=words)
-            residual_axes.axhline(0, color=FAINT, lw=0.8)
-            residual_axes.plot(time, self._residual(channel)[rows], color=BLUE, lw=1)
-            reading_axes.set_ylabel(axis_label(channel))
-            residual_axes.set_ylabel("residual")
+                readings.plot(time, self.table[prefix + channel.column][rows], color=colour, lw=1.3, label=words)
+            residual.axhline(0, color=FAINT, lw=0.8)
+            residual.plot(time, self._residual(channel)[rows], color=BLUE, lw=1)
+            readings.set_ylabel(axis_label(channel))
+            residual.set_ylabel("residual")
         grid[0, 0].legend(loc="best")
         grid[0, 0].set_title(f"run {name}" if len(self.rows) > 1 else "")
         grid[-1, 0].set_xlabel("time [s]")
@@ -189,13 +159,12 @@ class TimeOverlay:
 
     def to_json(self) -> str:
         """Data of the interactive figure: for each run its times and, by channel, measured and simulated readings."""
-        points_per_curve = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
+        curves = len(self.channels) * (1 + len(self.simulated))
+        most, spent, worst = max(200, POINTS // (len(self.rows) * curves)), 0, self.worst
         runs: Json = {}
-        spent = 0
-        worst = self.worst
-        for name in (worst, *(name for name in self.rows if name != worst)):
-            rows = self._thinned(self.rows[name], points_per_curve)
-            spent += len(rows) * len(self.channels) * (1 + len(self.simulated))
+        for name in sorted(self.rows, key=lambda name: name != worst):
+            rows = self._thinned(self.rows[name], most)
+            spent += len(rows) * curves
             if runs and spent > 2 * POINTS:
                 break
             runs[name] = {
@@ -214,16 +183,15 @@ class TimeOverlay:
 
     def _thinned(self, rows: np.ndarray, most: int) -> np.ndarray:
         """Up to about `most` rows in order: of each group the rows of the extreme readings of every channel."""
-        groups = max(1, most // (2 * len(self.channels)))
         if len(rows) <= most:
             return rows
         kept_rows = {0, len(rows) - 1}
-        for part in np.array_split(np.arange(len(rows)), groups):
+        for part in np.array_split(np.arange(len(rows)), max(1, most // (2 * len(self.channels)))):
             for channel in self.channels:
                 readings = self.table[channel.column][rows[part]]
                 if np.isfinite(readings).any():
                     kept_rows |= {int(part[np.nanargmin(readings)]), int(part[np.nanargmax(readings)])}
-        return rows[np.array(sorted(kept_rows))]
+        return rows[sorted(kept_rows)]
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

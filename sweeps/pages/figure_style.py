@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -43,11 +42,13 @@ def axis_label(channel: Channel) -> str:
 
 _RC: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # part of matplotlib; browsers without it use Verdana, which has the same widths
-    "font.size": 9.5,
+    "font.size": 8.5,
+    "text.color": INK,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
     "axes.labelcolor": INK,
+    "axes.labelsize": 9.5,
     "axes.edgecolor": "#666666",
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -58,6 +59,7 @@ _RC: dict[Any, Any] = {
     "lines.linewidth": 1.8,
     "legend.frameon": False,
     "legend.fontsize": 8.5,
+    "legend.title_fontsize": 8.5,
     "svg.fonttype": "none",
     "svg.hashsalt": "mmrjax",
     "figure.facecolor": "white",
@@ -114,13 +116,6 @@ def figure_as_svg(fig: Figure) -> str:
     if (engine := fig.get_layout_engine()) is not None:
         fig.set_dpi(72)  # of SVG
         engine.execute(fig)
-        # numbers of a map that overlap are hidden: they are also in a table
-        for axes in fig.axes:
-            numbers = [number for number in axes.texts if re.fullmatch(r"[-−+.\d ]+%?", number.get_text())]
-            pairs = itertools.combinations([Text.get_window_extent(number) for number in numbers], 2)
-            if axes.images and any(a.overlaps(b) and min(a.y1, b.y1) - max(a.y0, b.y0) > 2 for a, b in pairs):
-                for number in numbers:
-                    number.set_visible(False)
         fig.set_layout_engine(None)  # otherwise savefig would draw everything once more for the layout
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -140,21 +135,12 @@ def label_line_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour:
     """Writes `words` at the last finite point of a line, in its colour."""
     finite = np.nonzero(np.isfinite(y))[0]
     if finite.size:
-        offset = keywords.pop("offset", (5, 0))
         axes.annotate(
-            words,
-            (x[finite[-1]], y[finite[-1]]),
-            xytext=offset,
-            textcoords="offset points",
-            color=colour,
-            va="center",
-            fontsize=8.5,
-            annotation_clip=False,
-            **keywords,
-        )
+            words, (x[finite[-1]], y[finite[-1]]), xytext=keywords.pop("offset", (5, 0)), textcoords="offset points",
+            color=colour, va="center", annotation_clip=False, **keywords,
+        )  # fmt: skip
 
 
 def add_corner_note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: Any) -> None:
     """Adds a remark in a corner of the axes. Coordinates are axes fractions."""
-    keywords = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left", **keywords}
-    axes.text(x, y, words, transform=axes.transAxes, **keywords)
+    axes.text(x, y, words, transform=axes.transAxes, **{"va": "top", **keywords})

@@ -1,4 +1,4 @@
-"""Figures of runs from standstill: current and speeds over time, with inrush and stages of the start marked."""
+"""Figures over time: settled logs, starts from standstill with their stages, readings, frequency responses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.data import Columns
 from calibration.data.clock import applied_drive
 from calibration.data.runs import Runs
 from calibration.data.settling import Settled
@@ -22,10 +21,10 @@ from mmrjax.derived.start_figures import (
     last_samples,
     stages_of_histories,
 )
-from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES
 from sweeps.pages import words
 from sweeps.pages.figure_style import (
     BLUE,
@@ -38,8 +37,7 @@ from sweeps.pages.figure_style import (
     configuration_looks,
     new_figure,
 )
-from sweeps.report.run_tables import UNITS
-from sweeps.report.settle_report import IMPOSED
+from sweeps.report.run_tables import axis_title, quantity_column
 
 #: Samples per segment of a frequency response, and smallest coherence of drawn points.
 SEGMENT, COHERENT = 256, 0.7
@@ -49,17 +47,12 @@ SHORTEST = 32
 
 def draw_settled_log(found: Settled) -> Figure:
     """The imposed quantity and each channel over the log, with settled stretches and their means."""
-    runs = found.runs
-    rows = np.concatenate([s.rows for s in found.stretches]) if found.stretches else np.zeros(0, int)
-    rows_drawn = np.unique(np.concatenate([rows, np.arange(len(runs))]))
-    clock, begin = np.zeros(len(runs)), 0.0
-    run = runs.run_names
-    for name in dict.fromkeys(run.tolist()):  # recordings one after the other
-        run_rows = np.flatnonzero(run == name)
-        clock[run_rows] = begin + runs["time_s"][run_rows] - runs["time_s"][run_rows[0]]
-        begin = float(clock[run_rows[-1]])
-    order = rows_drawn[np.argsort(clock[rows_drawn], kind="stable")]
-    lines = [("{}\n[{}]".format(*IMPOSED[runs.layout.imposed]), applied_drive(runs))]
+    runs, clock, begin = found.runs, np.zeros(len(found.runs)), 0.0
+    for rows in runs.rows_by_run().values():  # recordings one after the other
+        clock[rows] = begin + runs["time_s"][rows] - runs["time_s"][rows[0]]
+        begin = float(clock[rows[-1]])
+    order = np.argsort(clock, kind="stable")
+    lines = [(axis_title(runs.layout.imposed_column).replace(" [", "\n["), applied_drive(runs))]
     lines += [
         (f"{s.channel.label}\n[{s.channel.unit}]", s.shown if len(s.angle) else runs[s.channel.column])
         for s in found.signals
@@ -68,70 +61,43 @@ def draw_settled_log(found: Settled) -> Figure:
     for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
         axes.plot(clock[order], values[order], color=FAINT, lw=0.8, rasterized=len(order) > 3000)
         for s in found.stretches:
-            ends = clock[s.rows[0]], clock[s.rows[-1]]
             if s.why:
                 continue
+            ends = clock[s.rows[[0, -1]]]
             axes.axvspan(*ends, color="#e3eef7", lw=0, zorder=0)
             mean = s.imposed if signal is None else s.mean[signal.channel.name]
             axes.plot(ends, (mean, mean), color=BLUE if signal is None else VERMILION, lw=2)
-        axes.set_ylabel(label, color=INK)
+        axes.set_ylabel(label)
     grid[-1, 0].set_xlabel("time [s], recordings one after the other")
     return fig
 
 
 INRUSH = 0.04  # s, shown enlarged
-_STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", "#eaf5ea", "uniform"))
-
-
-def _largest_magnitude(time: np.ndarray, values: np.ndarray) -> float:
-    """Value with the largest magnitude of a sampled curve, also between samples. NaN without samples."""
-    if len(values) < 3:
-        return float(values[np.argmax(np.abs(values))]) if values.size else np.nan
-    return float(
-        np.sign(values[np.argmax(np.abs(values))]) * curve_peak(jnp.asarray(time), jnp.asarray(np.abs(values)))
-    )
+_STAGES = (("I", "#fdebd0"), ("II", "#e3eef7"), ("III", "#eaf5ea"))
+#: Stages of a run without samples.
+_NO_STAGES = StartStages(1.0, 0.0, 0.0, 0.0, 0.0, (np.nan,) * 3, np.nan)
 
 
 @dataclasses.dataclass(frozen=True)
 class StartRun:
-    """A run from standstill, up to its last finite sample.
+    """A run from standstill, up to its last finite sample, with current and speeds times its sense.
 
     Attributes:
         name: heading, configuration, status.
+        stages: stages of the start.
         time: [s].
         current: current of all motors [A].
         speed, theoretical: V and r_k ω_k [mm/s].
-        stages: stages of the start. Current and speeds are stored multiplied by its `sense`. None without numbers.
     """
 
     name: str
     configuration: str
     status: str
+    stages: StartStages
     time: np.ndarray
     current: np.ndarray
     speed: np.ndarray
     theoretical: np.ndarray
-    stages: StartStages | None
-
-    @property
-    def sense(self) -> float:
-        """Direction in which the shafts turn at the end, 1 or -1."""
-        return 1.0 if self.stages is None else self.stages.sense
-
-    @property
-    def starting(self) -> float:
-        """End of stage I [s]."""
-        return 0.0 if self.stages is None else self.stages.starting
-
-    @property
-    def slipping(self) -> float:
-        """End of stage II [s]."""
-        return 0.0 if self.stages is None else self.stages.slipping
-
-    @property
-    def settled(self) -> float:
-        """t' [s]."""
-        return 0.0 if self.stages is None else self.stages.settled
 
     @property
     def gets_under_way(self) -> bool:
@@ -140,8 +106,9 @@ class StartRun:
 
     @property
     def peak(self) -> float:
-        """Largest current [A], with the drawn sign."""
-        return _largest_magnitude(self.time, self.current)
+        """Current of the largest magnitude, also between samples [A]."""
+        size = np.abs(self.current)
+        return float(np.sign(self.current[size.argmax()]) * curve_peak(jnp.asarray(self.time), jnp.asarray(size)))
 
     @property
     def ended(self) -> tuple[float, float]:
@@ -161,23 +128,22 @@ def start_runs(
         which: index of each member's configuration in `robot`.
         names: headings of the members.
     """
-    from mmrjax.model.signals import STATUSES
-
-    answer = []
-    for k, (name, found) in enumerate(
+    answer, signals = [], history.signals
+    for k, (name, stages) in enumerate(
         zip(names, stages_of_histories(robot, history, which[: len(names)]), strict=True)
     ):
-        current = np.asarray(history.signals.total_current[k])
-        upto = slice(0, count_finite_samples(current))
-        speed, theoretical = (
-            np.asarray(x[k])[upto] for x in (history.signals.speed, history.signals.speed_theoretical)
+        stages, upto = stages or _NO_STAGES, count_finite_samples(np.asarray(signals.total_current[k]))
+        time, current, speed, theoretical = (
+            np.asarray(x[k])[:upto]
+            for x in (history.time, signals.total_current, signals.speed, signals.speed_theoretical)
         )
-        sense = 1.0 if found is None else found.sense
-        kind, status_word, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
-        times = np.asarray(history.time[k])[upto]
+        scale = stages.sense / MM
         answer.append(
-            StartRun(name, kind, status_word, times, sense * current[upto], scale * speed, scale * theoretical, found)
-        )
+            StartRun(
+                name, robot.configurations.names[int(which[k])], STATUSES[int(status[k])], stages, time,
+                stages.sense * current, scale * speed, scale * theoretical,
+            )
+        )  # fmt: skip
     return answer
 
 
@@ -190,112 +156,74 @@ def draw_starts(shown: list[StartRun], current_title: str = "total current", spe
     look = configuration_looks(start.configuration for start in shown)
     for (zoom, current, speed), start in zip(grid, shown, strict=True):
         zoom.set_title(f"{start.name}\nfirst {1e3 * INRUSH:.0f} ms")
-        backward = ", backward positive" if start.sense < 0 else ""
+        backward = ", backward positive" if start.stages.sense < 0 else ""
         current.set_title(current_title + backward)
         speed.set_title(speed_title + backward)
         if not start.time.size:
             add_corner_note(zoom, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
         colour = look[start.configuration][0]
-        peak = int(np.argmax(start.current))
-        early = start.time <= INRUSH
-        zoom.plot(1e3 * start.time[early], start.current[early], color=colour)
-        top = 1.3 * max(float(start.current[early].max()), 1e-3)
-        zoom.set(xlim=(0, 1e3 * INRUSH), ylim=(min(0.0, 1.1 * float(start.current[early].min())), top))
-        zoom.set(xlabel="time [ms]", ylabel="total current [A]")
-        if early[peak]:
-            peak_point = (1e3 * start.time[peak], start.current[peak])
-            zoom.plot(*peak_point, "o", ms=5, color=colour)
-            zoom.annotate(
-                f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", peak_point, xytext=(8, -2),
-                textcoords="offset points", fontsize=8.5, va="top",
-            )  # fmt: skip
-        _shade_stages(zoom, start, 1e3)
+        _draw_inrush(zoom, start, colour)
         _draw_current(current, start, colour)
         _draw_speeds(speed, start, colour)
+        for axes, scale in ((zoom, 1e3), (current, 1.0), (speed, 1.0)):
+            _shade_stages(axes, start, scale)
     return fig
 
 
+def _draw_inrush(axes: Axes, start: StartRun, colour: str) -> None:
+    early, peak = start.time <= INRUSH, int(np.argmax(start.current))
+    current = start.current[early]
+    axes.plot(1e3 * start.time[early], current, color=colour)
+    axes.set(xlim=(0, 1e3 * INRUSH), ylim=(min(0.0, 1.1 * current.min()), 1.3 * max(current.max(), 1e-3)))
+    axes.set(xlabel="time [ms]", ylabel="total current [A]")
+    if early[peak]:
+        time, largest = 1e3 * start.time[peak], start.current[peak]
+        axes.plot(time, largest, "o", ms=5, color=colour)
+        axes.annotate(f"peak {largest:.3g} A\nat {time:.1f} ms", (time, largest), xytext=(8, -2),
+                      textcoords="offset points", va="top")  # fmt: skip
+
+
 def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
-    peak = float(start.current.max())
-    run = start.current[start.time > start.starting]
+    peak, run = float(start.current.max()), start.current[start.time > start.stages.starting]
     run = run[len(run) // 20 :] if len(run) > 20 else start.current
     top = max(1.75 * float(run.max()), 0.1)
     axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
     low = min(0.0, 1.1 * float(start.current.min()))
     axes.set(xlim=(0, start.time[-1]), ylim=(low, top if peak > top else 1.3 * max(peak, 1e-3)))
     axes.set(xlabel="time [s]", ylabel="total current [A]")
-    _shade_stages(axes, start)
     if peak > top:
-        add_corner_note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
+        add_corner_note(axes, f"peak {peak:.3g} A cut off", y=0.8, color=colour)
 
 
 def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
-    top = max(float(start.theoretical.max()), 1.0)
+    top, settled = max(float(start.theoretical.max()), 1.0), start.stages.settled
     axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4, label=r"$V_{x\,teor}$ (shafts)")
     axes.plot(start.time, start.speed, color=colour, label="$V_x$ (robot)")
     axes.set(xlim=(0, start.time[-1]), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top))
     axes.set(xlabel="time [s]", ylabel="speed [mm/s]")
-    _shade_stages(axes, start)
-    if 0 < start.settled < start.time[-1] and start.gets_under_way:
-        axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":", label=f"t' = {start.settled:.2f} s")
+    if 0 < settled < start.time[-1] and start.gets_under_way:
+        axes.axvline(settled, color=FAINT, lw=0.9, ls=":", label=f"t' = {settled:.2f} s")
     axes.legend(loc="lower right")
     if start.status not in words.SETTLED:
         add_corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
 
 
-def _shade_stages(axes: Axes, start: StartRun, scale: float = 1.0) -> None:
-    """Shades the stages behind a plot over time (unit 1/`scale` s), and labels them at the top."""
-    if not start.gets_under_way:
-        return
-    bounds = scale * np.array([0.0, start.starting, start.slipping, start.time[-1]])
-    left_edge, right_edge = axes.get_xlim()
-    for (stage, shade, name), left, right in zip(_STAGES, bounds[:-1], bounds[1:], strict=True):
-        right = min(right, right_edge)
-        if right <= left:
-            continue
-        axes.axvspan(left, right, color=shade, zorder=0, lw=0)
-        width = (right - left) / (right_edge - left_edge)
-        if width > _text_width_share(axes, stage):
-            text = f"{stage}\n{name}" if width > _text_width_share(axes, name) else stage
-            axes.text(
-                (left + right) / 2, 0.985, text, transform=axes.get_xaxis_transform(), ha="center",
-                va="top", fontsize=8.5, fontweight="bold", color=INK,
-            )  # fmt: skip
+def _shade_stages(axes: Axes, start: StartRun, scale: float) -> None:
+    """Shades the stages behind a plot over time (unit 1/`scale` s), and numbers them at the top."""
+    bounds = np.minimum(scale * np.array(start.stages.bounds), axes.get_xlim()[1])
+    for (stage, shade), left, right in zip(_STAGES, bounds[:-1], bounds[1:], strict=True):
+        if right > left and start.gets_under_way:
+            axes.axvspan(left, right, color=shade, zorder=0, lw=0)
+            if right - left > 0.04 * bounds[-1]:
+                axes.text((left + right) / 2, 0.985, stage, transform=axes.get_xaxis_transform(), ha="center",
+                          va="top", fontweight="bold")  # fmt: skip
 
 
-def _text_width_share(axes: Axes, text: str) -> float:
-    """Approximate fraction of the axes' width that a bold text of 8.5 points takes [-]."""
-    return 0.72 * 8.5 * len(text) / 72 * axes.figure.dpi / axes.bbox.width
-
-
-@dataclasses.dataclass(frozen=True)
-class ShaftRun:
-    """A run of a shaft over time, up to its last finite sample.
-
-    Attributes:
-        name: heading, status.
-        time: [s].
-        readings: readings of each channel by name, in the unit of its column.
-    """
-
-    name: str
-    status: str
-    time: np.ndarray
-    readings: Columns
-
-    def largest(self, channel: str) -> float:
-        """Reading with the largest magnitude."""
-        return _largest_magnitude(self.time, self.readings[channel])
-
-    def last(self, channel: str) -> float:
-        """Reading at the end."""
-        values = self.readings[channel]
-        return float(values[-1]) if values.size else np.nan
-
-
-def shaft_runs(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[ShaftRun]:
-    """Members of a batch of runs, with the readings of their instruments.
+def draw_readings_over_time(
+    read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]
+) -> Figure:
+    """Readings of runs on a shaft over time: one row for each run, one panel for each channel.
 
     Args:
         read: channels of the robot.
@@ -303,29 +231,16 @@ def shaft_runs(read: Iterable[Channel], history: Any, status: np.ndarray, names:
         status: codes of how its members ended.
         names: headings of the members.
     """
-    from mmrjax.model.signals import STATUSES
-
-    answer, shown_channels = [], tuple(c for c in read if c.over_time)
-    for k, name in enumerate(names):
-        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in shown_channels}
-        finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
-        upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
-        member_readings = {channel: values[upto] for channel, values in readings.items()}
-        answer.append(ShaftRun(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], member_readings))
-    return answer
-
-
-def draw_readings_over_time(shown: list[ShaftRun]) -> Figure:
-    """One row for each run, one panel for each channel."""
-    read = channels.channels_named(shown[0].readings)
-    fig, grid = new_figure(len(shown), len(read), 2.6 * len(shown))
-    for row, course in zip(grid, shown, strict=True):
-        row[0].set_title(course.name)
-        for axes, channel in zip(row, read, strict=True):
-            axes.plot(course.time, course.readings[channel.name], color=BLUE)
+    over_time = [c for c in read if c.over_time]
+    fig, grid = new_figure(len(names), len(over_time), 2.6 * len(names))
+    for k, (row, name) in enumerate(zip(grid, names, strict=True)):
+        row[0].set_title(name)
+        for axes, channel in zip(row, over_time, strict=True):
+            axes.plot(history.time[k], history.reading[channel.name][k] / channel.factor, color=BLUE)
             axes.set(xlabel="time [s]", ylabel=axis_label(channel))
-        if course.status not in words.SETTLED:
-            add_corner_note(row[0], f"ends: {words.short_status(course.status)}", color=VERMILION)
+        ending = STATUSES[int(status[k])]
+        if ending not in words.SETTLED:
+            add_corner_note(row[0], f"ends: {words.short_status(ending)}", color=VERMILION)
     return fig
 
 
@@ -369,6 +284,7 @@ def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapp
         simulated: prefixes of the simulated columns, and their names.
     """
     table, drive, rows = runs.columns, applied_drive(runs), runs.rows_by_run().values()
+    unit = quantity_column(runs.layout.imposed_column).unit
     fig, grid = new_figure(2, len(read), 4.4, sharex=True)
     for (gain, phase), channel in zip(grid.T, read, strict=True):
         columns = [channel.column, *(prefix + channel.column for prefix in simulated)]
@@ -391,7 +307,7 @@ def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapp
             if label != "measured":
                 angle[1:][np.abs(np.diff(angle)) > 180] = np.nan  # no line from -180° to 180°
             phase.semilogx(frequency, angle, color=colour, **style)
-        gain.set(title=channel.label, ylabel=f"gain [{channel.unit}/{UNITS[runs.layout.imposed_column]}]")
+        gain.set(title=channel.label, ylabel=f"gain [{channel.unit}/{unit}]")
         phase.set(xlabel="frequency [Hz]", ylabel="phase [°]", ylim=(-190, 190), yticks=[-180, -90, 0, 90, 180])
     grid[0, 0].legend(loc="best")
     return fig

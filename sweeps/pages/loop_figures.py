@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,38 +21,23 @@ from sweeps.pages.figure_style import (
     GREEN,
     INK,
     ORANGE,
+    axis_label,
     configuration_looks,
     new_figure,
     outer_legend,
 )
 from sweeps.report.fit_tables import Change
-from sweeps.report.run_tables import imposed_column
+from sweeps.report.run_tables import axis_title, imposed_column
 
 #: Label and unit of the error of each equation, and the variable over which it is drawn, with its label.
 DEFECT_WORDS = {
     "electrical": ("voltage missing", "V", "current_A", "total motor current [A]"),
     "track": ("torque missing at the pulley", "N·m", "motor_speed_rpm", "motor speed [rpm]"),
-    "slip": ("speed lost", "mm/s", "slope_deg", "slope [deg]"),
+    "slip": ("speed lost", "mm/s", "slope_deg", "slope [°]"),
 }
 
-
-#: The same for a rig, whose output may be no pulley.
-RIG_WORDS = {"track": "torque missing at the output"}
-IMPOSED_WORDS = {
-    "supply_voltage_V": "supply voltage [V]",
-    "motor_speed_rpm": "motor speed [rpm]",
-    "motor_current_A": "motor current [A]",
-    "goal_angle_deg": "goal [deg]",
-    "goal_speed_rpm": "goal [rpm]",
-    "goal_current_A": "goal [A]",
-}
-#: Label and unit of conditions that no channel shows.
-CONDITION_WORDS = {
-    "supply_voltage_V": ("supply voltage", "V"),
-    "payload_kg": ("payload", "kg"),
-    "slope_deg": ("slope", "deg"),
-    "load_torque_Nm": ("load torque", "N·m"),
-}
+#: Label of the same error for a rig, whose output may be no pulley.
+RIG_TORQUE = "torque missing at the output"
 
 
 def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
@@ -76,36 +61,27 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
 
 def draw_time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict: str) -> Figure:
     """Statistics that need histories: autocorrelation of the residual, waves in shaft angle, drift in time."""
-    sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)]
-    sides = sides if verdict != "none" else sides[1:]
-    count = len(channels)
-    fig, grid = new_figure(1, count + 1, 2.9, width_ratios=[1] * count + [1.5])
-    for axes, channel in zip(grid[0, :count], channels, strict=True):
-        lags = np.arange(1, detail.before.memory.lags + 1)
-        limit = 2 / np.sqrt(detail.samples)
+    sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)][verdict == "none" :]
+    lags, limit = np.arange(1, detail.before.memory.lags + 1), 2 / np.sqrt(detail.samples)
+    fig, ((*panels, explained),) = new_figure(1, len(channels) + 1, 2.9, width_ratios=[1] * len(channels) + [1.5])
+    for axes, channel in zip(panels, channels, strict=True):
         axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
         axes.axhline(0, color=FAINT, lw=0.8)
         for when, side, colour in sides:
             axes.plot(lags, side.memory.autocorrelation[channel.name], "o-", ms=3, lw=1, color=colour, label=when)
-        axes.set_title(channel.label)
-        axes.set_xlabel("lag [samples]")
-    grid[0, 0].set_ylabel("autocorrelation of the residual")
-    grid[0, 0].legend(loc="best")
-    axes = grid[0, count]
+        axes.set(title=channel.label, xlabel="lag [samples]")
+    panels[0].set_ylabel("autocorrelation of the residual")
+    panels[0].legend(loc="best")
     lines = [*(word for word, _ in detail.before.orders), *["drift in time"] * (detail.before.drift is not None)]
     for k, (_, side, colour) in enumerate(sides):
         values = [o.explained for o in (*side.orders.values(), side.drift) if o]
         place = np.arange(len(lines)) + (k - (len(sides) - 1) / 2) * 0.36
-        axes.barh(place, np.sqrt(values), height=0.34, color=colour)
-    axes.set_yticks(range(len(lines)), lines, fontsize=8)
-    axes.invert_yaxis()
-    axes.grid(axis="y", visible=False)
-    axes.set_xlabel("would explain [σ]")
+        explained.barh(place, np.sqrt(values), height=0.34, color=colour)
+    explained.set_yticks(range(len(lines)), lines)
+    explained.invert_yaxis()
+    explained.grid(axis="y", visible=False)
+    explained.set_xlabel("would explain [σ]")
     return fig
-
-
-#: Most lags of a correlation with the input [samples].
-LAGS = 20
 
 
 #: Share of a variable's range over which the change by an effect is averaged to measure its smoothness.
@@ -120,7 +96,7 @@ def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
     own_column = imposed_column(table)
     if own_column == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
         return table[own_column] * table["duty"], "voltage given to the motors [V]"
-    return table[own_column], IMPOSED_WORDS[own_column]
+    return table[own_column], axis_title(own_column)
 
 
 def roughness(x: np.ndarray, y: np.ndarray) -> float:
@@ -138,11 +114,11 @@ def conditions_and_readings(table: Columns) -> Columns:
 
     A variable of each side also appears as mean and difference.
     """
-    labels = {c.column: (c.label, c.unit) for c in EVERY} | CONDITION_WORDS
+    columns = {axis_label(c): table[c.column] for c in EVERY if c.column in table}
+    names = ("supply_voltage_V", "payload_kg", "slope_deg", "load_torque_Nm")
+    columns |= {axis_title(name): table[name] for name in names if name in table}
     if "duty_left" in table and "supply_voltage_V" in table:
-        sides = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in SIDES}
-        table, labels = table | sides, labels | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in SIDES}
-    columns = {f"{label} [{unit}]": table[c] for c, (label, unit) in labels.items() if c in table}
+        columns |= {f"voltage, {s} [V]": table["supply_voltage_V"] * table[f"duty_{s}"] for s in SIDES}
     values, words = imposed_axis(table)
     columns |= {words: values}
     for label, column in list(columns.items()):
@@ -164,12 +140,10 @@ def driving_variable(table: Columns, change: np.ndarray, driver: str = "") -> tu
     """
     use = np.isfinite(change)
     columns = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
-    finite_columns = {k: v for k, v in columns.items() if np.isfinite(v[use]).all()}
-    finite_columns = {
-        k: v for k, v in finite_columns.items() if driver in k.split() and np.ptp(v[use]) > 0
-    } or finite_columns
-    label = min(finite_columns, key=lambda k: roughness(finite_columns[k][use], change[use]))
-    return finite_columns[label], label
+    columns = {k: v for k, v in columns.items() if np.isfinite(v[use]).all()}
+    preferred = {k: v for k, v in columns.items() if driver in k.split() and np.ptp(v[use]) > 0} or columns
+    label = min(preferred, key=lambda k: roughness(preferred[k][use], change[use]))
+    return preferred[label], label
 
 
 def _turns_once(values: np.ndarray) -> bool:
@@ -177,52 +151,52 @@ def _turns_once(values: np.ndarray) -> bool:
     return len(values) > 1 and int(np.count_nonzero(np.diff(np.sign(np.diff(values))))) <= 1
 
 
-def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Figure:
-    """Law of each effect found, over its condition: readings minus those of the robot without the effect.
+def draw_effect_law(found: DiscoveryResult, table: Columns, name: str, change: Change) -> Figure:
+    """Law of an effect found, over its condition: readings minus those of the robot without the effect.
 
     The figure shows measurements with ±2 sd, the refit without effects, and the law with the 95 % band of its
     amplitude. Backward runs have hollow dots and their own line.
     """
-    fig, grid = new_figure(1, len(changes), 3.4)
-    readings, is_included = found.readings_of_rows, found.included
+    fig, ((axes,),) = new_figure(1, 1, 3.4)
+    readings, used, c = found.readings_of_rows, found.included, change.channel
+    effect = BY_NAME.get(name)
+    x, label = driving_variable(
+        table, np.where(used, change.with_it - change.without, np.nan), "" if effect is None else effect.driver
+    )
+    k = [x.name for x in found.channels].index(c.name)
+    size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
+    measured, before, law = (
+        (values - change.without)[used] / c.factor
+        for values in (readings.measured[:, k], readings.before[:, k], change.with_it)
+    )
     imposed, imposed_label = imposed_axis(table)
-    backward, imposed = (table[imposed_column(table)] < 0)[is_included], imposed[is_included]
-    for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
-        c = change.channel
-        effect = BY_NAME.get(name)
-        effect_size = np.where(is_included, change.with_it - change.without, np.nan)
-        x, label = driving_variable(table, effect_size, "" if effect is None else effect.driver)
-        k = [x.name for x in found.channels].index(c.name)
-        size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
-        measured, before, law = (
-            (values - change.without)[is_included] / c.factor
-            for values in (readings.measured[:, k], readings.before[:, k], change.with_it)
-        )
-        x, sd = x[is_included], readings.sd[is_included, k] / c.factor
-        share = 196 * abs(size.sd / size.value)
-        band = share / 100 * abs(law)
-        axes.axhline(0, color=FAINT, lw=0.8)
-        for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
-            if not way.any():
-                continue
-            rows, is_labelled = np.flatnonzero(way)[np.argsort(x[way])], way is not backward or backward.all()
-            axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
-                          label=words)  # fmt: skip
-            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if is_labelled else None)
-            is_line = _turns_once(law[rows]) or roughness(x[rows], law[rows]) < SMOOTH
-            levels = np.zeros(len(rows)) if is_line else imposed[rows]
-            by_level = "" if is_line else f" by {imposed_label.partition(' [')[0]}"
-            for line in (rows[levels == level] for level in np.unique(levels)):
-                law_words = f"new law{by_level}, 95 % band (±{share:.2g} %)" if is_labelled else None
-                if not (is_line or _turns_once(law[line])):
-                    axes.errorbar(x[line], law[line], band[line], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
-                                  alpha=0.6, label=law_words)  # fmt: skip
-                else:
-                    axes.plot(x[line], law[line], color=BLUE, lw=1.2, label=law_words)
-                    axes.fill_between(x[line], (law - band)[line], (law + band)[line], color=BLUE, alpha=0.3, lw=0)
-                is_labelled = False
-        axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
-    outer_legend(grid[0, 0], "upper left")
+    backward, imposed = (table[imposed_column(table)] < 0)[used], imposed[used]
+    x, sd, share = x[used], readings.sd[used, k] / c.factor, 196 * abs(size.sd / size.value)
+    band = share / 100 * abs(law)
+    axes.axhline(0, color=FAINT, lw=0.8)
+    old_words: str | None = "old law, refitted"
+    for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
+        if not way.any():
+            continue
+        rows = np.flatnonzero(way)[np.argsort(x[way])]
+        axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
+                      label=words)  # fmt: skip
+        axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label=old_words)
+        is_line = _turns_once(law[rows]) or roughness(x[rows], law[rows]) < SMOOTH
+        lines = [rows] if is_line else [rows[imposed[rows] == level] for level in np.unique(imposed[rows])]
+        by_level = "" if is_line else f" by {imposed_label.partition(' [')[0]}"
+        law_words = f"new law{by_level}, 95 % band (±{share:.2g} %)" if old_words else None
+        for line in lines:
+            if is_line or _turns_once(law[line]):
+                axes.plot(x[line], law[line], color=BLUE, lw=1.2, label=law_words)
+                axes.fill_between(x[line], (law - band)[line], (law + band)[line], color=BLUE, alpha=0.3, lw=0)
+            else:
+                axes.errorbar(x[line], law[line], band[line], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
+                              alpha=0.6, label=law_words)  # fmt: skip
+            law_words = None
+        old_words = None  # the legend names each law once
+    axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
+    outer_legend(axes, "upper left")
     return fig
 
 
@@ -262,28 +236,28 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
         crosses_zero: True if readings may cross zero (`Layout.crosses_zero`). Only closed equations are then drawn.
     """
     whens = ("before",) if verdict in ("none", *WITHOUT_NAME) else ("before", "after")
-    panels = {b: DEFECT_WORDS[b] for b in (closed_equations(table) if crosses_zero else DEFECT_WORDS)}
-    fig, grid = new_figure(len(whens), len(panels), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
-    for row, when in enumerate(whens):
-        for axes, (balance, (words, unit, column, of_what)) in zip(grid[row], panels.items(), strict=True):
-            balance_words = RIG_WORDS.get(balance, words) if crosses_zero else words
+    balances = closed_equations(table) if crosses_zero else list(DEFECT_WORDS)
+    fig, grid = new_figure(len(whens), len(balances), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
+    for row, when in zip(grid, whens, strict=True):
+        for axes, balance in zip(row, balances, strict=True):
+            words, unit, column, variable = DEFECT_WORDS[balance]
             by_side = defects_by_side(table, when, balance)
             names = [(name, side) for name in dict.fromkeys(table["configuration"]) for side in by_side]
+            looks = configuration_looks(map(", ".join, names)).values()
             axes.axhline(0, color=FAINT, lw=0.8)
-            for (name, side), (colour, marker) in zip(
-                names, configuration_looks(map(", ".join, names)).values(), strict=True
-            ):
-                of_configuration = table["configuration"] == name
-                x, label = _defect_variable(table, column, of_what, side)
-                y = by_side[side][of_configuration] * (1e3 if balance == "slip" else 1.0)
-                axes.plot(
-                    x[of_configuration], y, marker, ms=4.5, color=colour, label=f"{name}, {side}".removesuffix(", ")
-                )
-            axes.set_title(f"{'torque' if crosses_zero and balance == 'track' else balance}, {when}")
-            axes.set_ylabel(f"{balance_words} [{unit}]")
-            if row == len(whens) - 1:
+            for (name, side), (colour, marker) in zip(names, looks, strict=True):
+                rows = table["configuration"] == name
+                x, label = _defect_variable(table, column, variable, side)
+                y = by_side[side][rows] * (1e3 if balance == "slip" else 1.0)
+                axes.plot(x[rows], y, marker, ms=4.5, color=colour, label=f"{name}, {side}".removesuffix(", "))
+            torque = crosses_zero and balance == "track"
+            axes.set(
+                title=f"{'torque' if torque else balance}, {when}",
+                ylabel=f"{RIG_TORQUE if torque else words} [{unit}]",
+            )
+            axes.locator_params(axis="x", nbins=5)
+            if when == whens[-1]:
                 axes.set_xlabel(label)
-                axes.locator_params(axis="x", nbins=5)
     outer_legend(grid[0, 0], "upper right")
     return fig
 
@@ -292,21 +266,18 @@ def draw_unnamed_curve(found: UnnamedDiscrepancy) -> Figure:
     """The unnamed defect, run by run over the variable that shows it best, with the smooth curve and its band."""
     variable = found.variable if found.window is None else str(found.window["axis"])
     abscissa = EVERY_VARIABLE.get(variable, Variable("rad", 0.0, 0.0, "", f"phase of the wave, {variable}", "rad"))
-    words, scale = abscissa.label, 1 / abscissa.shown
-    words += f" [{abscissa.unit_shown}]" if abscissa.unit_shown else ""
-    fig, grid = new_figure(1, 1, 3.4)
-    axes = grid[0, 0]
+    label = f"{abscissa.label} [{abscissa.unit_shown}]".removesuffix(" []")
+    fig, ((axes,),) = new_figure(1, 1, 3.4)
     axes.axhline(0, color=FAINT, lw=0.8)
     if found.over is not None and found.defect is not None and found.defect_sd is not None:
-        finite = np.isfinite(found.defect)
-        axes.errorbar(found.over[finite] * scale, found.defect[finite], 2 * found.defect_sd[finite],
-                      fmt="o", ms=4, color=ORANGE, lw=0.7, label="each run, ±2 sd")  # fmt: skip
+        axes.errorbar(found.over / abscissa.shown, found.defect, 2 * found.defect_sd, fmt="o", ms=4, color=ORANGE,
+                      lw=0.7, label="each run, ±2 sd")  # fmt: skip
     if found.window is not None:
-        first, last = (float(found.window[end]) * scale for end in ("low", "high"))
+        first, last = (float(found.window[end]) / abscissa.shown for end in ("low", "high"))
         axes.axvspan(first, last, color="#eeeeee", lw=0, zorder=0)
-    low, high = found.value - 1.96 * found.sd, found.value + 1.96 * found.sd
-    axes.fill_between(found.at * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
-    axes.plot(found.at * scale, found.value, color=GREEN, label="smooth curve")
-    axes.set(xlabel=words, ylabel=f"missing in the {place_in_words(found.place)} [{found.unit}]")
+    x, half = found.at / abscissa.shown, 1.96 * found.sd
+    axes.fill_between(x, found.value - half, found.value + half, color="#cfe3f2", lw=0, label="95 %")
+    axes.plot(x, found.value, color=GREEN, label="smooth curve")
+    axes.set(xlabel=label, ylabel=f"missing in the {place_in_words(found.place)} [{found.unit}]")
     axes.legend(loc="best")
     return fig

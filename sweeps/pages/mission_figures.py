@@ -11,7 +11,6 @@ from scipy.integrate import cumulative_trapezoid
 from calibration.data import Columns, Json
 from mmrjax.model.channels import SIDES
 from mmrjax.model.robot import Robot
-from sweeps.capabilities import UNLIMITED
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -25,8 +24,11 @@ from sweeps.pages.figure_style import (
 )
 
 _SIDE_COLOURS = (("left", BLUE), ("right", VERMILION))
-#: Units of a time axis: shortest mission [s], size [s], name.
-_TIMES = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
+
+
+def _time_unit(seconds: float) -> tuple[float, str]:
+    """Unit of a time axis of this length: its size [s] and name."""
+    return (3600.0, "h") if seconds >= 7200 else (60.0, "min") if seconds >= 600 else (1.0, "s")
 
 
 def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
@@ -39,30 +41,20 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
         linear: True if the profile is linear between rows.
         sides: number of motors.
     """
-    spans = [float(rows["time_s"][-1]), *([cycle] if cycle is not None else [])]
-    titles = ["the mission", "its first cycle"]
+    spans = {"the mission": float(rows["time_s"][-1])} | ({} if cycle is None else {"its first cycle": cycle})
     fig, grid = new_figure(4, len(spans), 9.6, width_ratios=[1.5, 1.0][: len(spans)], sharex="col")
-    for column, (span, title) in enumerate(zip(spans, titles, strict=False)):
-        axes = grid[:, column]
-        _, size, unit = next(t for t in _TIMES if span >= t[0])
+    for (speed, current, heat, source), (title, span) in zip(grid.T, spans.items(), strict=True):
+        size, unit = _time_unit(span)
         shown_rows = {key: value[rows["time_s"] <= span] for key, value in rows.items()}
         time = shown_rows["time_s"] / size
-        is_first_column = column == 0
-        axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
-        _draw_speed(axes[0], time, shown_rows, linear, legend=is_first_column)
-        sizes = ", sizes of both sides" if "duty_left" in rows else ""
-        axes[1].set_title(f"current of all motors, and duty{sizes}" if is_first_column else "current, and duty")
-        _draw_current(axes[1], time, shown_rows, sides, legend=is_first_column)
-        unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
-        limit_words = (
-            ""
-            if unlimited or _limit_is_near(shown_rows, limit)
-            else f", the winding's limit of {limit:.0f} °C beyond the scale"
-        )
-        axes[2].set_title("temperatures" + (limit_words if is_first_column else ""))
-        _draw_temperatures(axes[2], time, shown_rows, limit, legend=is_first_column)
-        _draw_source(axes[3], time, shown_rows)
-        axes[3].set(xlabel=f"time [{unit}]", xlim=(0, span / size))
+        speed.set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
+        _draw_speed(speed, time, shown_rows, linear)
+        current.set_title(f"current of all motors, and duty{', sizes' if 'duty_left' in rows else ''}")
+        _draw_current(current, time, shown_rows, sides)
+        heat.set_title("temperatures")
+        _draw_temperatures(heat, time, shown_rows, limit)
+        _draw_source(source, time, shown_rows)
+        source.set(xlabel=f"time [{unit}]", xlim=(0, span / size))
     return fig
 
 
@@ -72,25 +64,24 @@ def draw_sides(rows: Columns) -> Figure:
     Args:
         rows: rows of history.csv of one run with sides.
     """
-    fig, grid = new_figure(3, 1, 6.4, sharex=True)
-    span = float(rows["time_s"][-1])
-    _, size, unit = next(t for t in _TIMES if span >= t[0])
+    fig, ((current,), (drive,), (turn,)) = new_figure(3, 1, 6.4, sharex=True)
+    size, unit = _time_unit(float(rows["time_s"][-1]))
     time = rows["time_s"] / size
     column, factor, label = ("duty_{}", 100.0, "duty [%]") if "duty_left" in rows else (
         "motor_speed_{}_rpm", 1.0, "motor speed [rpm]"
     )  # fmt: skip
+    limit = 0.1
     for side, color in _SIDE_COLOURS:
-        grid[0, 0].plot(time, rows[f"motor_current_{side}_A"], color=color, lw=1.0, label=side)
-        grid[1, 0].plot(time, factor * rows[column.format(side)], color=color, lw=1.0)
-    grid[2, 0].plot(time, rows["yaw_rate_rad_s"], color=INK, lw=1.2)
-    for axes, text in zip(grid[:, 0], ("current of a motor [A]", label, "yaw rate [rad/s]"), strict=True):
-        axes.set_ylabel(text)
-    later = [rows[f"motor_current_{side}_A"][time > 0.1 * time[-1]] for side in ("left", "right")]
-    limit = 2.5 * float(np.nanmax(np.abs(np.concatenate(later)), initial=0.1))
-    low, high = grid[0, 0].get_ylim()
-    grid[0, 0].set_ylim(max(low, -limit), min(high, limit))
-    grid[0, 0].legend(ncols=2, fontsize=8)
-    grid[-1, 0].set(xlabel=f"time [{unit}]", xlim=(0, time[-1]))
+        amperes = rows[f"motor_current_{side}_A"]
+        current.plot(time, amperes, color=color, lw=1.0, label=side)
+        drive.plot(time, factor * rows[column.format(side)], color=color, lw=1.0)
+        limit = max(limit, float(np.nanmax(np.abs(amperes[time > 0.1 * time[-1]]), initial=0.0)))
+    turn.plot(time, rows["yaw_rate_rad_s"], color=INK, lw=1.2)
+    low, high = current.get_ylim()
+    current.set(ylabel="current of a motor [A]", ylim=(max(low, -2.5 * limit), min(high, 2.5 * limit)))
+    current.legend(ncols=2)
+    drive.set_ylabel(label)
+    turn.set(ylabel="yaw rate [rad/s]", xlabel=f"time [{unit}]", xlim=(0, time[-1]))
     return fig
 
 
@@ -106,8 +97,7 @@ def _right_axes(axes: Axes, label: str, colour: str) -> Axes:
 
 def _draw_legend(axes: Axes, *others: Axes) -> None:
     handles = [h for a in (axes, *others) for h in a.get_legend_handles_labels()[0]]
-    labels = [str(h.get_label()) for h in handles]
-    axes.legend(handles, labels, loc="upper center", ncols=len(labels), fontsize=8)
+    axes.legend(handles=handles, loc="upper center", ncols=len(handles))
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for the label
 
@@ -133,7 +123,7 @@ def _draw_curve(
     axes.plot((ends[1:] + ends[:-1]) / 2, means, color=colour, lw=width, label=label)
 
 
-def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bool) -> None:
+def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool) -> None:
     turning = "demanded_motor_speed_rpm" in rows  # a shaft's
     speed = rows["motor_speed_rpm"] if turning else rows.get("speed_mm_s", rows["theoretical_speed_mm_s"])
     _draw_curve(axes, time, speed, BLUE, "speed", 1.4)
@@ -143,32 +133,26 @@ def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legen
     axes.set_ylabel("motor speed [rpm]" if turning else "speed [mm/s]")
     if turning or not np.any(rows["slope_deg"]):
         add_corner_note(axes, "" if turning else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
-        if legend:
-            _draw_legend(axes)
+        _draw_legend(axes)
         return
     slope = _right_axes(axes, "slope [°]", GREEN)
-    slope.plot(
-        time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle="default" if linear else "steps-post"
-    )
+    style = "default" if linear else "steps-post"
+    slope.plot(time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle=style)
     largest_slope = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
     slope.set_ylim(-largest_slope, largest_slope)
-    if legend:
-        _draw_legend(axes, slope)
+    _draw_legend(axes, slope)
 
 
-def _draw_current(axes: Axes, time: np.ndarray, rows: Columns, sides: float, legend: bool) -> None:
-    current, driven = (mean_of_motors(rows, *name) for name in (("motor_current", "_A"), ("duty", "")))
-    current = sides * current
+def _draw_current(axes: Axes, time: np.ndarray, rows: Columns, sides: float) -> None:
+    current, driven = sides * mean_of_motors(rows, "motor_current", "_A"), mean_of_motors(rows, "duty", "")
     _draw_curve(axes, time, current, VERMILION, "current")
     top = int(np.argmax(np.abs(current)))
     axes.plot(time[top], current[top], marker="o", ms=4, color=INK, ls="none", label=f"peak {current[top]:.2f} A")
     axes.set_ylabel("current [A]")
     duty = _right_axes(axes, "duty [%]", PURPLE)
     _draw_curve(duty, time, 100 * driven, PURPLE, "duty", 0.9)
-    low = -110 if (driven < 0).any() else 0
-    duty.set_ylim(low, 110)
-    if legend:
-        _draw_legend(axes, duty)
+    duty.set_ylim(-110 if (driven < 0).any() else 0, 110)
+    _draw_legend(axes, duty)
 
 
 def mean_of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
@@ -177,65 +161,55 @@ def mean_of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
     return np.asarray(np.mean(of_sides, axis=0) if of_sides else rows[f"{name}{unit}"])
 
 
-def _limit_is_near(rows: Columns, limit: float) -> bool:
-    """True if the limit is near enough to be drawn. A far limit would flatten the curve."""
-    return "housing_temperature_C" in rows and bool(np.max(rows["winding_temperature_C"]) > 0.6 * limit)
-
-
-def _draw_temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float, legend: bool) -> None:
+def _draw_temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float) -> None:
     if "housing_temperature_C" not in rows:
         add_corner_note(axes, "not computed: the robot's file lacks\nthe thermal resistance of the windings")
         axes.set_yticks([])
         return
-    _draw_curve(axes, time, rows["winding_temperature_C"], VERMILION, "winding", 1.4)
-    axes.plot(time, rows["housing_temperature_C"], color=ORANGE, lw=1.4, label="housing")
-    top, bottom = float(np.max(rows["winding_temperature_C"])), float(np.min(rows["housing_temperature_C"]))
-    if _limit_is_near(rows, limit):
+    winding, housing = rows["winding_temperature_C"], rows["housing_temperature_C"]
+    _draw_curve(axes, time, winding, VERMILION, "winding", 1.4)
+    axes.plot(time, housing, color=ORANGE, lw=1.4, label="housing")
+    top, bottom = float(np.max(winding)), float(np.min(housing))
+    if top > 0.6 * limit:  # a far limit would flatten the curve
         axes.axhline(limit, color=INK, lw=1.0, ls="--", label=f"limit {limit:.0f} °C")
         axes.set_ylim(bottom - 2, 1.1 * max(top, limit))
     else:
         axes.set_ylim(bottom - 0.5, top + max(1.0, 0.3 * (top - bottom)))
     axes.set_ylabel("temperature [°C]")
-    if legend:
-        _draw_legend(axes)
+    _draw_legend(axes)
 
 
 def _draw_source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
-    charge = rows["state_of_charge"]
-    volts = rows["source_voltage_V"]
+    charge, volts = rows["state_of_charge"], rows["source_voltage_V"]
     if not np.isfinite(charge).any():
-        axes.set_title("voltage of the supply")
         axes.plot(time, volts, color=BLUE, lw=1.3)
-        axes.set_ylabel("voltage [V]")
+        axes.set(title="voltage of the supply", ylabel="voltage [V]")
         return
     axes.set_title("state of charge, and voltage of the battery")
     axes.plot(time, 100 * charge, color=GREEN, lw=1.8)
     axes.set_ylabel("charge [%]", color=GREEN)
-    span = float(charge.max() - charge.min())
-    if span > 0.05:
+    if np.ptp(charge) > 0.05:
         axes.set_ylim(0, 105)
-    right_axes = _right_axes(axes, "voltage [V]", BLUE)
-    _draw_curve(right_axes, time, volts, BLUE, "voltage", 0.8)
+    _draw_curve(_right_axes(axes, "voltage [V]", BLUE), time, volts, BLUE, "voltage", 0.8)
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
-        add_corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)
+        add_corner_note(axes, "broken line: cells fall below their cut-off", y=0.06, va="bottom", color=FAINT)
 
 
 #: A path bends by no more between two points that are drawn [rad].
 BEND = 0.05
 
 
-def _draw_outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float, color: str) -> None:
-    """The robot from above: its contact lines, a bar between them and an arrow pointing ahead."""
+def _draw_outline(axes: Axes, robot: Robot, row: Json, place: complex, yaw: float, color: str) -> None:
+    """The robot from above: its contact lines and an arrow pointing ahead. `place`: ahead + i · left [m]."""
     length = float(robot.running_gear.wheelbase)
     width = float(robot.configurations[str(row["configuration"])].turning.width)
-    ahead, sideways = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
-    middle = np.array([x, y])
-    for side in (0.5, -0.5):
-        ends = [middle + side * width * sideways + s * length * ahead for s in (0.5, -0.5)]
-        axes.plot([-e[1] for e in ends], [e[0] for e in ends], color=color, lw=3.5, solid_capstyle="round")
-    tip = middle + 0.5 * length * ahead
-    axes.annotate("", (-tip[1], tip[0]), (-y, x), arrowprops={"arrowstyle": "-|>", "color": color})
+    ahead = np.exp(1j * yaw)
+    for side in (0.5j, -0.5j):
+        ends = place + ahead * (side * width + length * np.array([0.5, -0.5]))
+        axes.plot(-ends.imag, ends.real, color=color, lw=3.5, solid_capstyle="round")
+    tip, arrow = place + 0.5 * length * ahead, {"arrowstyle": "-|>", "color": color}
+    axes.annotate("", (-tip.imag, tip.real), (-place.imag, place.real), arrowprops=arrow)
 
 
 def path_arcs(
@@ -261,38 +235,29 @@ def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.nda
     """The path of a run over time from above, with the robot at its start, at its end and in between."""
     finite = np.isfinite(x)
     x, y, yaw = x[finite], y[finite], yaw[finite]
-    fig, grid = new_figure(1, 1, 4.6)
-    axes = grid[0, 0]
+    fig, ((axes,),) = new_figure(1, 1, 4.6)
     ahead, aside = path_arcs(x, y, yaw)
     axes.plot(-aside, ahead, color=BLUE)
-    for k, color in ((0, FAINT), (len(x) // 2, FAINT), (len(x) - 1, INK)):
-        _draw_outline(axes, robot, row, x[k], y[k], yaw[k], color)
+    for k, color in ((0, FAINT), (len(x) // 2, FAINT), (-1, INK)):
+        _draw_outline(axes, robot, row, complex(x[k], y[k]), yaw[k], color)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("to the right of the start [m]", color=INK)
-    axes.set_ylabel("uphill of the start, or ahead of it [m]", color=INK)
+    axes.set(xlabel="to the right of the start [m]", ylabel="uphill of the start, or ahead of it [m]")
     return fig
 
 
 def draw_yaw_rates(turns: Columns, row: Json) -> Figure:
-    """Currents of both sides and power over the yaw rate of settled turns. The requested turn is marked."""
-    fig, grid = new_figure(1, 2, 3.4)
-
-    def rate(motion: Json) -> np.ndarray:
-        # On the spot the curvature is without limit, the yaw rate is not.
-        return np.asarray(motion["yaw_rate_rad_s"], float)
-
-    other_turns = {name: np.asarray(values)[1:] for name, values in turns.items()}
-    order = np.argsort(rate(other_turns))
-    for side, color in _SIDE_COLOURS:
-        column = f"motor_current_{side}_A"
-        grid[0, 0].plot(rate(other_turns)[order], other_turns[column][order], color=color, label=side)
-        grid[0, 0].plot(rate(row), float(row[column]), marker="o", color=color, ls="none")
-    grid[0, 0].set_ylabel("current of a motor [A]", color=INK)
-    grid[0, 0].legend()
-    grid[0, 1].plot(rate(other_turns)[order], other_turns["power_supply_W"][order], color=INK)
-    grid[0, 1].plot(rate(row), float(row["power_supply_W"]), marker="o", color=INK, ls="none")
-    grid[0, 1].set_ylabel("power of the supply [W]", color=INK)
-    for axes in grid[0]:
+    """Currents of both sides and power over the yaw rate of settled turns, which on the spot has a limit, unlike the
+    curvature. The requested turn is marked.
+    """
+    fig, ((current, power),) = new_figure(1, 2, 3.4)
+    rate = np.asarray(turns["yaw_rate_rad_s"], float)
+    order = 1 + np.argsort(rate[1:])  # the first is the requested turn
+    lines = [(current, f"motor_current_{side}_A", color, side) for side, color in _SIDE_COLOURS]
+    for axes, column, color, label in (*lines, (power, "power_supply_W", INK, None)):
+        axes.plot(rate[order], np.asarray(turns[column])[order], color=color, label=label)
+        axes.plot(float(row["yaw_rate_rad_s"]), float(row[column]), "o", color=color)
+    current.legend()
+    for axes, label in ((current, "current of a motor [A]"), (power, "power of the supply [W]")):
         axes.axhline(0, color=FAINT, lw=0.8)
-        axes.set_xlabel("yaw rate, positive to the left [rad/s]", color=INK)
+        axes.set(xlabel="yaw rate, positive to the left [rad/s]", ylabel=label)
     return fig

@@ -21,6 +21,7 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import is_done
 from sweeps.export.joint import UNLIMITED
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, new_figure, outer_legend
+from sweeps.report.run_tables import operating_points
 
 #: Uses of power and their colours: losses in the order of the drivetrain, then useful power.
 ITEMS = {
@@ -63,35 +64,21 @@ ON_SHAFT = {"track and slip": "load"}
 
 def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -> Figure:
     """One bar for each run [W], from the motor's losses to the power that lifts the robot or that the load takes."""
-    fig, grid = new_figure(1, 1, 1.15 + 0.42 * len(names))
-    axes, parts = grid[0, 0], power_by_item(runs)
-    labels = {} if has_ground else ON_SHAFT
+    fig, ((axes,),) = new_figure(1, 1, 1.15 + 0.42 * len(names))
     supply, slope = power_sources(runs)
-    total = supply + slope
-    bar_starts = np.zeros(len(names))
-    bar_positions = np.arange(len(names), dtype=float)
-    for item, colour in ITEMS.items():
-        value = np.maximum(parts[item], 0.0)
-        if value.max() > 1e-6:
-            axes.barh(
-                bar_positions,
-                value,
-                left=bar_starts,
-                height=0.7,
-                color=colour,
-                label=labels.get(item, item),
-                ec="white",
-                lw=0.6,
-            )
-        for y, x, width in zip(bar_positions, bar_starts, value, strict=True):
-            if width >= 0.04 * total.max():
-                ink = "white" if colour in _DARK else "black"
-                axes.text(x + width / 2, y, f"{width:.1f}", ha="center", va="center", fontsize=8, color=ink)
-        bar_starts = bar_starts + value
-    for y, watts, supplied_power, falls in zip(bar_positions, total, supply, slope, strict=True):
-        text = f"{supplied_power:.1f} W" + (f" + {falls:.1f} W from the slope" if falls > 1e-6 else "")
-        axes.text(watts, y, f"  {text}", va="center", fontsize=8.5)
-    axes.set_yticks(bar_positions, names, fontsize=8.5)
+    total, places, left = supply + slope, np.arange(len(names)), np.zeros(len(names))
+    for item, power in power_by_item(runs).items():
+        if power.max() > 1e-6:
+            power, colour = np.maximum(power, 0.0), ITEMS[item]
+            label = item if has_ground else ON_SHAFT.get(item, item)
+            bars = axes.barh(places, power, left=left, height=0.7, color=colour, label=label, ec="white", lw=0.6)
+            numbers = [f"{width:.1f}" if width >= 0.04 * total.max() else "" for width in power]
+            axes.bar_label(bars, numbers, label_type="center", color="white" if colour in _DARK else "black")
+            left = left + power
+    for y, (watts, falls) in enumerate(zip(supply, slope, strict=True)):
+        text = f"{watts:.1f} W" + (f" + {falls:.1f} W from the slope" if falls > 1e-6 else "")
+        axes.text(watts + falls, y, f"  {text}", va="center")
+    axes.set_yticks(places, names)
     axes.invert_yaxis()
     axes.grid(False)
     axis_factor = 1.35 if (slope > 1e-6).any() else 1.1
@@ -127,86 +114,68 @@ def drive_curves(robot: Robot, voltage: float) -> Columns:
     return {name: values[settled] for name, values in columns.items()}
 
 
-def operating_points(robot: Robot, runs: Columns) -> Columns:
-    """Torque at the gearbox output, speed and current of one motor in settled runs, from columns of `runs.csv`."""
-    radius = np.array([float(robot.configurations[name].radius) for name in runs["configuration"]])
-    output = runs["theoretical_speed_mm_s"] / 1e3 / radius
-    with np.errstate(divide="ignore", invalid="ignore"):
-        torque = runs["power_gear_W"] / float(robot.sides) / output
-    speed = output * float(robot.gearbox.ratio) / RPM
-    return {"torque_Nm": torque, "motor_rpm": speed, "motor_A": runs["total_current_A"] / float(robot.sides)}
-
-
 def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
     """Chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
     keys = ("configuration", "payload_kg", "slope_deg", "state_of_charge", "supply_voltage_V")
-    single_corners = (
-        corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys)
+    cells = [tuple(corner.get(key) for key in keys) for corner in corners]
+    rows = dict.fromkeys(
+        cell for cell in cells if None not in cell[:3] and not any(isinstance(x, list | tuple) for x in cell)
     )
-    cells = dict.fromkeys(tuple(corner.get(key) for key in keys) for corner in single_corners)
-    rows = [cell for cell in cells if None not in cell[:3]]
-    full = float(robot.battery.voltage_no_load(0.0))
-    if not rows:
-        return draw_drive_chart(robot, [full], dict.fromkeys(("torque_Nm", "motor_rpm", "motor_A"), np.zeros(0)))
-    names, payload, slope, charge, volts = zip(*rows, strict=True)
-    on_battery = np.array([v is None for v in volts])
-    charge_used = float(robot.battery.capacity) * (1 - np.array([1.0 if c is None else max(c, 1e-9) for c in charge]))
-    supply = np.array([full if v is None else v for v in volts], float)
-    conditions = Conditions(
-        list(names), supply, slope_deg=np.array(slope, float), payload=np.array(payload, float),
-        battery=on_battery.astype(float), discharge=np.where(on_battery, charge_used, 0.0),
-    )  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a cut-off that rarely acts
-        runs = simulate(robot, conditions)
-    columns = {"configuration": np.array(names), **output_columns(runs.result, robot.channels)}
-    points = operating_points(robot, columns)
-    done = np.asarray(is_done(np.asarray(runs.status)))
-    settled = {name: values[done] for name, values in points.items()}
-    return draw_drive_chart(robot, sorted(set(supply.tolist()))[-3:], settled)
+    full, points = float(robot.battery.cells * robot.battery.voltage_no_load(0.0)), None
+    supply = np.array([full if volts is None else volts for *_, volts in rows] or [full])
+    if rows:
+        names, payload, slope, charge, volts = zip(*rows, strict=True)
+        on_battery = np.array([v is None for v in volts])
+        used = float(robot.battery.capacity) * np.array([0.0 if c is None else 1 - max(c, 1e-9) for c in charge])
+        conditions = Conditions(
+            list(names), supply, slope_deg=np.array(slope), payload=np.array(payload),
+            battery=on_battery.astype(float), discharge=on_battery * used,
+        )  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # a cut-off that rarely acts
+            runs = simulate(robot, conditions)
+        done = np.asarray(is_done(np.asarray(runs.status)))
+        columns = {"configuration": np.array(names), **output_columns(runs.result, robot.channels)}
+        points = operating_points(robot, {name: values[done] for name, values in columns.items()})
+    return draw_drive_chart(robot, sorted(set(supply.tolist()))[-3:], points)
 
 
-def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -> Figure:
+def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns | None) -> Figure:
     """Speed, current and efficiency of one motor and gear over the torque at the output.
 
     Shaded areas are torques up to the winding's continuous current, and up to the driver's current limit.
     """
-    fig, grid = new_figure(1, 3, 3.0, sharex=True)
-    panels = {
-        "motor_rpm": "motor speed [rpm]",
-        "motor_A": "current of one motor [A]",
+    fig, (panels,) = new_figure(1, 3, 3.0, sharex=True)
+    labels = {
+        "motor_rpm": "motor speed [rpm]", "motor_A": "current of one motor [A]",
         "efficiency_percent": "efficiency [%]",
-    }
-    bears, limit = float(robot.motor.current_continuous), float(robot.driver.current_limit)
-    reached = np.nanmax(points["torque_Nm"], initial=0.0)
+    }  # fmt: skip
+    limit, largest_torque = float(robot.driver.current_limit), 0.0
     for voltage, style in zip(sorted(voltages, reverse=True), ("-", "--", ":"), strict=False):
         curves = drive_curves(robot, voltage)
-        if curves["torque_Nm"].size < 2:
+        torque = curves["torque_Nm"]
+        if torque.size < 2:
             continue
-        continuous = float(np.interp(bears, curves["motor_A"], curves["torque_Nm"]))
-        if style == "-":
-            largest_torque = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
-            for axes in grid[0]:
-                axes.axvspan(0, min(continuous, largest_torque), color=GREEN, alpha=0.18, lw=0, label="continuous")
-                axes.axvspan(
-                    min(continuous, largest_torque),
-                    largest_torque,
-                    color=ORANGE,
-                    alpha=0.12,
-                    lw=0,
-                    label="short time",
-                )
+        if not largest_torque:
+            continuous = float(np.interp(float(robot.motor.current_continuous), curves["motor_A"], torque))
+            reached = 0.0 if points is None else np.nanmax(points["torque_Nm"], initial=0.0)
+            largest_torque = min(max(2.5 * continuous, 1.2 * reached), torque[-1])
+            continuous = min(continuous, largest_torque)
+            for axes in panels:
+                axes.axvspan(0, continuous, color=GREEN, alpha=0.18, lw=0, label="continuous")
+                axes.axvspan(continuous, largest_torque, color=ORANGE, alpha=0.12, lw=0, label="short time")
                 axes.set_xlim(0, largest_torque)
-        shown = curves["torque_Nm"] <= largest_torque
-        for axes, (name, label) in zip(grid[0], panels.items(), strict=True):
-            axes.plot(curves["torque_Nm"][shown], curves[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
+        shown = torque <= largest_torque
+        for axes, (name, label) in zip(panels, labels.items(), strict=True):
+            axes.plot(torque[shown], curves[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
             axes.set(xlabel="torque at the gearbox output [N·m]", ylabel=label)
             axes.set_ylim(bottom=0)
-    for axes, name in zip(grid[0], ("motor_rpm", "motor_A"), strict=False):
-        axes.plot(points["torque_Nm"], points[name], "o", ms=5, color=INK, label="operating points")
+    if points is not None:
+        for axes, name in zip(panels, ("motor_rpm", "motor_A"), strict=False):
+            axes.plot(points["torque_Nm"], points[name], "o", ms=5, color=INK, label="operating points")
     if limit < UNLIMITED:
-        grid[0, 1].axhline(limit, color=ORANGE, lw=1, label="driver's limit")
-    outer_legend(grid[0, 1], "upper left")
+        panels[1].axhline(limit, color=ORANGE, lw=1, label="driver's limit")
+    outer_legend(panels[1], "upper left")
     return fig
 
 
@@ -232,18 +201,19 @@ def draw_drive_plane(robot: Robot, voltage: float, points: Columns | None = None
             the torque of the load.
     """
     motor, gearbox = robot.motor, robot.gearbox
-    bears = min(float(motor.current_continuous), 0.5 * float(motor.current_stall(voltage)))
-    most = float(motor.torque_constant * gearbox.ratio * gearbox.efficiency_load) * bears
-    most = most if points is None else float(np.nanmax(np.abs(points["simulated_Nm"])))
+    if points is None:
+        bears = min(float(motor.current_continuous), 0.5 * float(motor.current_stall(voltage)))
+        most = float(motor.torque_constant * gearbox.ratio * gearbox.efficiency_load) * bears
+    else:
+        most = float(np.nanmax(np.abs(points["simulated_Nm"])))
     load = np.linspace(-most, most, 2 * LOADS + 1)
     forward, backward = (torque_of_motor(robot, v, load) for v in (voltage, -voltage))
     fig, ((plane, share),) = new_figure(1, 2, 3.6)
     plane.fill_between(load, backward, forward, color="#e3e3e3", lw=0, label="at rest, friction holds the load")
     for efficiency in EFFICIENCIES:
-        plane.plot([0, most], [0, most / efficiency], ":", color=FAINT, lw=1)
-        plane.plot([-most, 0], [-most * efficiency, 0], ":", color=FAINT, lw=1)
+        plane.plot([-most, 0, most], [-most * efficiency, 0, most / efficiency], ":", color=FAINT, lw=1)
         plane.annotate(f"{100 * efficiency:.0f} %", (most, most / efficiency), (2, 0), textcoords="offset points",
-                       fontsize=8, color=INK, va="center", annotation_clip=False)  # fmt: skip
+                       va="center", annotation_clip=False)  # fmt: skip
     plane.plot(load, load, "--", color=FAINT, lw=1, label="without losses")
     plane.plot(load, forward, color=BLUE, label="runs forward")
     plane.plot(load, backward, color=ORANGE, label="runs backward")
@@ -251,13 +221,13 @@ def draw_drive_plane(robot: Robot, voltage: float, points: Columns | None = None
         at_load = [np.interp(points["simulated_Nm"], way, load) for way in (forward, backward)]
         x = np.where(points["forward"], *at_load)
         plane.plot(x, points["measured_Nm"], "o", ms=4, color=INK, label="measured")
-    plane.set(xlabel="torque of the load [N·m]", ylabel="motor torque × ratio [N·m]", title="drive and back-drive")
-    plane.set_xlim(-most, most)
+    label = "torque of the load [N·m]"
+    plane.set(xlabel=label, ylabel="motor torque × ratio [N·m]", title="drive and back-drive", xlim=(-most, most))
     ahead, behind = load > 0, load < 0
     share.plot(load[ahead], 100 * load[ahead] / forward[ahead], color=BLUE, label="motor drives the load")
     returned = 100 * np.maximum(forward[behind] / load[behind], 0)
     share.plot(-load[behind], returned, "--", color=BLUE, label="load drives the motor")
-    share.set(xlabel="torque of the load [N·m]", ylabel="efficiency [%]", ylim=(0, 103), title="efficiency each way")
+    share.set(xlabel=label, ylabel="efficiency [%]", ylim=(0, 103), title="efficiency each way")
     share.legend(loc="lower right")
     outer_legend(plane, "upper left")
     return fig

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib import colors
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -28,9 +30,7 @@ from sweeps.pages.figure_style import (
     PURPLE,
     SKY,
     VERMILION,
-    add_corner_note,
     configuration_looks,
-    label_line_end,
     new_figure,
 )
 from sweeps.report.resonance_report import ResonanceResult, ripple_percent
@@ -45,58 +45,52 @@ _UNREAD = {"slides": ">", "failed": "x", "tips": "^", "stalled": "_", "too_slow"
 
 def draw_resonance_map(found: ResonanceResult) -> Figure:
     """Natural frequencies and harmonics of the passing frequency. Below them, ripple at every speed and payload."""
-    rows = len(found.modes)
-    heights = [4.4, *(0.5 + 0.2 * rows for _ in MAPS)]
+    heights = [4.4, *[0.5 + 0.2 * len(found.modes)] * len(MAPS)]
     fig, grid = new_figure(4, 1, sum(heights) + 0.6, sharex=True, height_ratios=heights)
-    draw_campbell_diagram(grid[0, 0], found)
-    for axes, name in zip(grid[1:, 0], MAPS, strict=True):
-        draw_ripple_map(axes, found, name)
-    grid[-1, 0].set_xlabel("speed of the robot [mm/s]")
-    fastest = np.nanmax(found.table["speed_mean_mm_s"])
-    grid[0, 0].set_xlim(0, 1.06 * fastest)
+    campbell, *maps = grid[:, 0]
+    _draw_campbell_diagram(campbell, found)
+    for axes, name in zip(maps, MAPS, strict=True):
+        _draw_ripple_map(axes, found, name)
+    maps[-1].set_xlabel("speed of the robot [mm/s]")
+    campbell.set_xlim(0, 1.06 * np.nanmax(found.table["speed_mean_mm_s"]))
     return fig
 
 
-def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
+def _draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     """Lines n × V / S, bands of natural frequencies, and the strongest line of each run, larger for more ripple."""
+    table, parts, read = found.table, found.passing, found.read
     bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
-    lines = [found.table[f"{name}_frequency_Hz"][found.read] for name in _MARKS]
-    highest = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
-    table, parts, top = found.table, found.passing, 1.15 * max([highest, *bands, 10.0])
-    fastest = float(np.nanmax(table["speed_mean_mm_s"]))
+    lines = [table[f"{name}_frequency_Hz"][read] for name in _MARKS]
+    highest = float(np.nanpercentile(np.concatenate(lines), 90)) if read.any() else 0.0
+    top, fastest = 1.15 * max([highest, *bands, 10.0]), float(np.nanmax(table["speed_mean_mm_s"]))
     place = np.inf
     for order in range(1, ORDERS + 1):
-        at_end = order * fastest * MM / parts.travel
+        at_end, last = order * fastest * MM / parts.travel, place
         axes.plot([0, fastest], [0, at_end], color=FAINT, lw=0.8, zorder=1)
-        is_inside, last = at_end <= top, place
-        place = fastest if is_inside else fastest * 0.985 * top / at_end
-        if last - place < 0.03 * fastest and not is_inside:
+        place = fastest * min(1.0, 0.985 * top / at_end)
+        if at_end > top and last - place < 0.03 * fastest:
             break  # labels and lines would overlap
-        axes.annotate(
-            f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if is_inside else (0, -2),
-            textcoords="offset points", color=FAINT, fontsize=8.5, va="center" if is_inside else "top",
-            bbox=None if is_inside else dict(boxstyle="round,pad=0.1", fc="white", ec="none"),
-        )  # fmt: skip
+        axes.annotate(f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0), textcoords="offset points",
+                      color=FAINT, va="center" if at_end <= top else "top")  # fmt: skip
     _draw_mode_bands(axes, found)
     for name, (colour, marker) in _MARKS.items():
-        ripple = table[f"{name}_ripple_percent"][found.read]
+        ripple = table[f"{name}_ripple_percent"][read]
+        most = float(np.nanmax(ripple))
         axes.scatter(
-            table["speed_mean_mm_s"][found.read], table[f"{name}_frequency_Hz"][found.read],
-            s=4 + 60 * (ripple / max(float(np.nanmax(ripple)), 1e-9)) ** 2, marker=marker, color=colour, alpha=0.55,
-            lw=0, zorder=3, label=f"{SIGNALS[name].label}, up to {ripple_percent(float(np.nanmax(ripple)))}",
+            table["speed_mean_mm_s"][read], table[f"{name}_frequency_Hz"][read],
+            s=4 + 60 * (ripple / max(most, 1e-9)) ** 2, marker=marker, color=colour, alpha=0.55, lw=0, zorder=3,
+            label=f"{SIGNALS[name].label}, up to {ripple_percent(most)}",
         )  # fmt: skip
     hits = [p for p in found.strong if p.mode]
     axes.scatter(
         [p.speed / MM for p in hits], [p.frequency for p in hits], s=130, marker="*", color="white",
         edgecolor=INK, lw=0.9, zorder=4, label="ripple peaks at a natural frequency: avoid" if hits else None,
     )  # fmt: skip
-    axes.set(ylim=(0, top), ylabel="frequency [Hz]")
     heading = f"{found.configuration}: {parts.name} pass every {parts.travel / MM:.4g} mm of travel"
-    axes.set_title(heading)
+    axes.set(ylim=(0, top), ylabel="frequency [Hz]", title=heading)
     axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, handletextpad=0.2,
-        columnspacing=1.2,
-        title="a run's strongest line, larger for more ripple (sd / mean):", title_fontsize=8.5, alignment="center",
+        loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, handletextpad=0.2, columnspacing=1.2,
+        title="a run's strongest line, larger for more ripple (sd / mean):", alignment="center",
     )  # fmt: skip
 
 
@@ -109,43 +103,38 @@ def _draw_mode_bands(axes: Axes, found: ResonanceResult) -> None:
         colour = _BANDS.get(name) or next(other_colours)
         low, high = min(m.low for _, m in modes), max(m.high for _, m in modes)
         axes.axhspan(low, high, color=colour, alpha=0.13, lw=0, zorder=0)
-        ends = (modes[0], modes[-1]) if len(modes) > 1 else (modes[0],)
-        for payload, mode in ends:
-            axes.axhline(mode.frequency, color=colour, lw=1.0, ls="-" if payload == modes[0][0] else "--", zorder=1)
-        means = " to ".join(dict.fromkeys(f"{mode.frequency:.0f}" for _, mode in ends))
-        loads = " to ".join(dict.fromkeys(f"{payload:g}" for payload, _ in ends))
+        ends = {modes[0][0]: modes[0][1], modes[-1][0]: modes[-1][1]}
+        for mode, style in zip(ends.values(), ("-", "--"), strict=False):
+            axes.axhline(mode.frequency, color=colour, lw=1.0, ls=style, zorder=1)
+        means = " to ".join(dict.fromkeys(f"{mode.frequency:.0f}" for mode in ends.values()))
+        loads = " to ".join(f"{payload:g}" for payload in ends)
         axes.annotate(
             f"{name} {means} Hz\n({loads} kg)", (0, (low + high) / 2), xytext=(4, 0), textcoords="offset points",
-            va="center", color=colour, fontsize=8.5, fontweight="bold", zorder=5,
+            va="center", color=colour, fontweight="bold", zorder=5,
             bbox=dict(boxstyle="round,pad=0.15", fc="white", ec="none", alpha=0.75),
         )  # fmt: skip
 
 
-def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
+def _draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     """Ripple of one signal over speed, one row per payload. Bars mark peaks to avoid."""
-    table, payloads = found.table, list(found.modes)
-    ripple = table[f"{name}_ripple_percent"]
-    settled = found.read & (table["status"] == "converged")
-    shown_ripple = ripple[settled] if settled.any() else ripple[found.read]
-    largest_ripple = float(np.nanmax(shown_ripple)) or 1.0
-    norm = colors.Normalize(0, largest_ripple)
-    guess = found.travel
+    table, payloads, speed = found.table, list(found.modes), found.travel
+    ripple, unsettled = table[f"{name}_ripple_percent"], table["status"] != "converged"
+    settled = found.read & ~unsettled
+    largest = float(np.nanmax(ripple[settled if settled.any() else found.read])) or 1.0
+    norm = colors.Normalize(0, largest)
     for row, payload in enumerate(payloads):
         rows = np.flatnonzero(table["payload_kg"] == payload)
-        rows = rows[np.argsort(guess[rows])]
+        rows = rows[np.argsort(speed[rows])]
         good = rows[found.read[rows]]
         if len(good) > 1:
-            x = guess[good]
+            x = speed[good]
             middle = (x[1:] + x[:-1]) / 2
             edges = np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
-            mesh = axes.pcolormesh(
-                edges, [row - 0.5, row + 0.5], ripple[good][None], norm=norm, cmap="YlOrBr", rasterized=True
-            )
-        for k in rows:
-            status = str(table["status"][k])
-            if status != "converged" and np.isfinite(guess[k]):
-                marker = _UNREAD.get(status, ".")
-                axes.scatter(guess[k], row, marker=marker, s=14, color=INK, lw=0.9, zorder=4)
+            axes.pcolormesh(edges, [row - 0.5, row + 0.5], ripple[good][None], norm=norm, cmap="YlOrBr",
+                            rasterized=True)  # fmt: skip
+        for k in rows[unsettled[rows] & np.isfinite(speed[rows])]:
+            marker = _UNREAD.get(str(table["status"][k]), ".")
+            axes.scatter(speed[k], row, marker=marker, s=14, color=INK, lw=0.9, zorder=4)
     for p in found.strong:
         if p.signal == name:
             place = (p.low / MM, payloads.index(p.payload) - 0.5)
@@ -154,14 +143,11 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     axes.set(ylim=(-0.5, len(payloads) - 0.5), ylabel="payload [kg]")
     axes.set_yticks(range(len(payloads)), [f"{p:g}" for p in payloads])
     axes.grid(False)
-    other_statuses = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
-    kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in other_statuses)
-    label = SIGNALS[name].label
-    remarks = [] if largest_ripple >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
-    remarks += [kinds] if kinds else []
-    axes.set_title(f"Ripple of {label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
-    if len(axes.collections) and "mesh" in locals():
-        axes.figure.colorbar(mesh, ax=axes, pad=0.01, aspect=8, label="sd / mean [%]")
+    axes.figure.colorbar(ScalarMappable(norm, "YlOrBr"), ax=axes, pad=0.01, aspect=8, label="sd / mean [%]")
+    remarks = [] if largest >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
+    statuses = dict.fromkeys(map(str, table["status"][unsettled]))
+    remarks += [f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in statuses]
+    axes.set_title(f"Ripple of {SIGNALS[name].label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
 
 
 TAIL = 0.3  # duration at the end of a run that is evaluated for ripple [s]
@@ -198,6 +184,12 @@ class GearRun:
     def settled_since(self, instant: float) -> bool:
         """True if the run after this instant [s] is long enough to evaluate ripple."""
         return bool(instant <= self.time[-1] - TAIL)
+
+    @property
+    def shown_time(self) -> np.ndarray:
+        """Time since the start of the drawn part [ms]."""
+        time = self.time[self.tail(SHOWN)]
+        return 1e3 * (time - time[0])
 
     @property
     def rolls(self) -> bool:
@@ -257,82 +249,63 @@ def ripple_row(gear: GearRun) -> tuple[Any, ...]:
 
 def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
     """Total current over the last `SHOWN` seconds of each run, with the period expected from eq. (34)."""
-    fig, grid = new_figure(1, len(shown), 3.0)
+    fig, (panels,) = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)
-    for axes, gear in zip(grid[0], shown, strict=True):
-        shown_samples, expected = gear.tail(SHOWN), gear.period
-        time, current = gear.time[shown_samples], gear.signals.total_current[shown_samples]
-        axes.plot(1e3 * (time - time[0]), current, color=look[gear.name][0])
+    for axes, gear in zip(panels, shown, strict=True):
+        time, current, period = gear.shown_time, gear.signals.total_current[gear.tail(SHOWN)], 1e3 * gear.period
+        axes.plot(time, current, color=look[gear.name][0])
         axes.axhline(current.mean(), color=FAINT, lw=0.9)
         low, high = current.min(), current.max()
         span = max(high - low, 1e-6)
         axes.set(ylim=(low - 0.2 * span, high + 0.45 * span), xlabel="time [ms]", ylabel="total current [A]")
         axes.ticklabel_format(axis="y", useOffset=False)
-        start = 1e3 * (time[int(np.argmax(current[: len(current) // 2]))] - time[0])
-        level = high + 0.12 * span
+        start, level = time[int(np.argmax(current[: len(current) // 2]))], high + 0.12 * span
         arrow = dict(arrowstyle="<->", color=INK, lw=1.0)
-        axes.annotate("", (start, level), (start + 1e3 * expected, level), arrowprops=arrow)
-        axes.text(start, level + 0.05 * span, f"{1e3 * expected:.1f} ms, eq. (34)", fontsize=8.5, va="bottom")
+        axes.annotate("", (start, level), (start + period, level), arrowprops=arrow)
+        axes.text(start, level + 0.05 * span, f"{period:.1f} ms, eq. (34)", va="bottom")
         axes.set_title(title.format(gear.name))
     return fig
 
 
 def draw_touchdowns(gear: GearRun, title: str = "grousers land (dotted)") -> Figure:
     """Current of a run on tracks over time with touchdowns marked, above the load on each grouser."""
-    fig, grid = new_figure(2, 1, 5.0, sharex=True)
-    shown_samples = gear.tail(SHOWN)
-    time = 1e3 * (gear.time[shown_samples] - gear.time[shown_samples][0])
-    lands = ripple_peaks.touchdown_times(
-        time, gear.reactions.grouser[shown_samples], gear.reactions.place[shown_samples]
-    )
-    upper, lower = grid[:, 0]
-    upper.plot(time, gear.signals.total_current[shown_samples], color=BLUE)
-    upper.set(ylabel="total current [A]")
-    upper.set_title(title)
-    shades = (BLUE, ORANGE, GREEN)
-    loads = gear.reactions.grouser[shown_samples]
-    for j in range(loads.shape[1]):
-        is_loaded = loads[:, j] > 0
-        if is_loaded.any():
-            lower.plot(time, np.where(is_loaded, loads[:, j], np.nan), color=shades[j % 3], lw=1.0)
+    fig, ((upper,), (lower,)) = new_figure(2, 1, 5.0, sharex=True)
+    rows, time = gear.tail(SHOWN), gear.shown_time
+    loads = gear.reactions.grouser[rows]
+    upper.plot(time, gear.signals.total_current[rows], color=BLUE)
+    upper.set(ylabel="total current [A]", title=title)
+    for load, shade in zip(loads.T, itertools.cycle((BLUE, ORANGE, GREEN)), strict=False):
+        if (load > 0).any():
+            lower.plot(time, np.where(load > 0, load, np.nan), color=shade, lw=1.0)
     lower.set(xlabel="time [ms]", ylabel="normal reaction of a grouser [N]", ylim=(0, None))
-    for axes in (upper, lower):
-        for instant in lands:
-            axes.axvline(instant, color=INK, lw=0.9, ls=":")
+    for instant in ripple_peaks.touchdown_times(time, loads, gear.reactions.place[rows]):
+        upper.axvline(instant, color=INK, lw=0.9, ls=":")
+        lower.axvline(instant, color=INK, lw=0.9, ls=":")
     return fig
 
 
 def draw_reactions(shown: list[GearRun], title: str = "{}, one side") -> Figure:
     """Normal reactions of one side: of all grousers and the lower guide on tracks, of both wheels on wheels."""
-    fig, grid = new_figure(1, len(shown), 3.2)
+    fig, (panels,) = new_figure(1, len(shown), 3.2)
     look = configuration_looks(gear.name for gear in shown)
-    for axes, gear in zip(grid[0], shown, strict=True):
-        shown_samples, colour = gear.tail(SHOWN), look[gear.name][0]
-        loads = gear.reactions
-        lines = (
-            {
-                "all grousers": (loads.grouser[shown_samples].sum(-1), colour),
-                "lower guide": (loads.guided[shown_samples].sum(-1), ORANGE),
-            }
-            if gear.on_tracks
-            else {
-                "both wheels": (loads.support[shown_samples].sum(-1), colour),
-                "front wheel": (loads.support[shown_samples, 0], BLUE),
-                "rear wheel": (loads.support[shown_samples, 1], GREEN),
-            }
-        )
-        time = 1e3 * (gear.time[shown_samples] - gear.time[shown_samples][0])
-        top = 0.0
-        for label, (values, shade) in lines.items():
-            axes.plot(time, values, color=shade, lw=1.4, alpha=0.9)
-            if not gear.on_tracks:
-                label_offset = {"front wheel": 7, "rear wheel": -7}.get(label, 0)  # they nearly coincide
-                label_line_end(axes, time, np.asarray(values), label, shade, offset=(5, label_offset))
-            top = max(top, float(np.max(values)))
-        axes.set(ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]")
-        axes.set_title(title.format(gear.name))
+    for axes, gear in zip(panels, shown, strict=True):
+        loads, rows, colour = gear.reactions, gear.tail(SHOWN), look[gear.name][0]
         if gear.on_tracks:
-            add_corner_note(axes, "orange: load on the lower guide, above it: load on all grousers")
+            lines = {
+                "all grousers": (loads.grouser[rows].sum(-1), colour),
+                "lower guide": (loads.guided[rows].sum(-1), ORANGE),
+            }
         else:
-            axes.set_xlim(0, 1.3e3 * SHOWN)
+            wheels = loads.support[rows]
+            lines = {
+                "both wheels": (wheels.sum(-1), colour), "front wheel": (wheels[:, 0], BLUE),
+                "rear wheel": (wheels[:, 1], GREEN),
+            }  # fmt: skip
+        for label, (values, shade) in lines.items():
+            axes.plot(gear.shown_time, values, color=shade, lw=1.4, alpha=0.9, label=label)
+        top = max(float(np.max(values)) for values, _ in lines.values())
+        axes.set(
+            ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]", title=title.format(gear.name)
+        )
+        axes.legend(loc="upper center", ncols=3)
     return fig

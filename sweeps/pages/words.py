@@ -13,59 +13,53 @@ STATUSES: dict[str, tuple[str, str]] = {
     "slides": ("slides", "traction demand above the adhesion limit μ_s N, so tracks or wheels spin"),
     "not_settled": (
         "not settled",
-        "still accelerates at the end (use a longer --duration), or the turn has no steady state (use --model drive)",
+        "still accelerates at the end (longer --duration), or the turn has no steady state (--model drive)",
     ),
     "battery_empty": ("battery empty", "the battery's capacity is used up"),
-    "failed": ("failed", "the solver found no solution. Please report the conditions"),
-    "tips": (
-        "tips over",
-        "the centre of mass is outside the base of support, or inertia carries the robot over",
-    ),
+    "failed": ("failed", "no solution found. Please report the conditions"),
+    "tips": ("tips over", "the centre of mass is outside the base of support, or inertia carries it over"),
     "reverses": ("reverses", "found a steady operating point backward"),
-    "rolls_back": (
-        "rolls back",
-        "gravity drives the robot downhill at a steady speed",
-    ),
+    "rolls_back": ("rolls back", "gravity drives the robot downhill at a steady speed"),
     "cut_off": ("cut off", "the cells were below their cut-off voltage for too long"),
 }
 
 #: Files of a run folder other than its page.
 FILES = {
     "drive.xml": "the drive for MuJoCo",
-    "scene.xml": "a MuJoCo scene with drive.xml",
+    "scene.xml": "a scene with drive.xml",
     "actuator.py": "the drive law in JAX, without mmrjax",
-    "actuator.jaxexport": "the same law for jax.export.deserialize",
-    "actuator.onnx": "the drive law as an ONNX model",
+    "actuator.jaxexport": "the same for jax.export.deserialize",
+    "actuator.onnx": "the drive law in ONNX",
     "mjlab_actuator.py": "the drive law in PyTorch, for mjlab",
     "feed_forward.csv": "voltage, current and losses by speed and torque",
     "feed_forward.h": "the same tables for C",
-    "draws.npz": "samples from the posterior, for NumPy",
+    "draws.npz": "samples from the posterior",
     "LAW.md": "description of the drive law",
-    "robot.toml": "the robot, for --robot of every command",
+    "robot.toml": "the robot, for --robot",
     "runs.csv": "every run",
-    "windows.csv": "windows of a log: voltage, velocity, acceleration",
-    "feedforward.json": "feedforward constants, gains and remarks",
+    "windows.csv": "voltage, velocity and acceleration of windows",
+    "feedforward.json": "constants, gains and remarks",
     "rows.csv": "readings and residuals of every row",
     "comparison.csv": "readings and errors of every row",
     "history.csv": "state and readings at every instant",
     "reactions.csv": "loads inside the running gear",
-    "segments.csv": "energy, distance and peaks of every segment",
+    "segments.csv": "energy, distance and peaks by segment",
     "requirements.csv": "every requirement",
     "requirements.toml": "the requirements as given",
-    "posterior.nc": "posterior of the fitted parameters, for --posterior",
+    "posterior.nc": "posterior of the parameters, for --posterior",
     "points.csv": "outputs at every operating point",
     "turns.csv": "settled turns",
-    "posture.csv": "posture: lever angles and contact loads",
+    "posture.csv": "lever angles and contact loads",
     "derivatives.csv": "every derivative",
     "modes.csv": "natural frequencies of the chassis",
-    "peaks.csv": "peaks of the ripple, with their speeds",
+    "peaks.csv": "peaks of the ripple",
     "indices.csv": "every sensitivity index",
     "settled.csv": "the settled runs, for loop and calibrate",
-    "stretches.csv": "every stretch of the log, and why it was left out",
+    "stretches.csv": "stretches of the log, and why they were left out",
     "results.zarr/": "outputs of every point",
-    "identity.json": "settings of the store, to resume the sweep",
-    "result.json": "everything on this page, for programs",
-    "config.resolved.toml": "every option of the command",
+    "identity.json": "settings, to resume the sweep",
+    "result.json": "all results, for programs",
+    "config.resolved.toml": "all options",
     "manifest.json": "versions, machine, time, hashes",
     "figures/": "the figures, as SVG",
 }
@@ -75,12 +69,15 @@ FILES = {
 LOOP_VERDICTS = {
     "none": "the residuals of the fitted model are consistent with noise",
     "undescribed": (
-        "in one channel, the refit's error or estimated noise exceeds a quarter of the measured rms. No set of "
-        "effects halves it on unseen runs and brings it below a quarter"
+        "error or noise of a channel exceeds a quarter of the measured rms after the refit, and no set of effects "
+        "halves it on unseen runs and brings it below a quarter"
     ),
     "place": "a term is missing in one equation, or in one of several that data cannot distinguish",
-    "unnamed": "former word for place. Up to schema mmrjax.loop/3 it also meant mechanism",
-    "mechanism": "the equation of the missing term and its variable are established",
+    "unnamed": "former word for place, and up to schema mmrjax.loop/3 for mechanism",
+    "mechanism": (
+        "the equation of the missing term and its variable are established: the term explains half of the misfit "
+        "beyond noise and is found without any block of runs"
+    ),
     "class": "a missing term is one of several effects that data cannot distinguish",
     "named": "each missing term is one established effect",
 }
@@ -103,27 +100,21 @@ def sink_labels(on_ground: bool) -> dict[str, str]:
 GLOSSARY = {
     "balance": "one equation of the model, such as the sum of torques at the wheel. Every effect enters one",
     "effect": "a term that the model may lack, see `mmrjax explain NAME`",
-    "established": "not explained by chance, by a smooth curve, by one run or by one block of runs",
+    "established": "not explained by chance, a smooth curve, one run or one block of runs",
     "tentative": "improves predictions and is in robot.toml, but failed a test of established effects",
-    "class": "effects that these data cannot distinguish",
-    "mechanism": (
-        "the equation that lacks a term, and its variable, but not its law. The term explains half of the "
-        "misfit beyond noise, predicts held-out runs, and is found again without any block of runs"
-    ),
-    "place": "the equation that lacks a term, or several that these data cannot distinguish",
-    "misfit beyond noise": "χ² minus the part that noise explains, about one per reading",
-    "refit": "the same model fitted to the runs, without new effects",
+    **{verdict: LOOP_VERDICTS[verdict] for verdict in ("class", "mechanism", "place")},
+    "misfit beyond noise": "χ² minus the part of noise, about one per reading",
+    "refit": "the model fitted to the runs without new effects",
     "seen": "errors on the runs that the fit used",
     "held out": "errors on runs left out of the fit, one slope, voltage or configuration at a time",
-    "noise": "standard deviation of readings, from --noise, `_sd` columns or an estimate",
-    "rms error": "root mean square of simulated minus measured, in percent of the rms of the measured readings",
+    "noise": "standard deviation of readings: --noise, `_sd` columns or an estimate",
+    "rms error": "root mean square of simulated minus measured, in percent of the measured rms",
     "σ": "standard deviation of an instrument: 19 of 20 readings are within 2 σ of the truth",
     "χ²": "sum of (simulated minus measured)² / σ² over all readings",
     "prior": "value and standard deviation of a parameter before the fit",
     "p": "probability that noise alone gives as extreme a result",
     "log likelihood": (
-        "logarithm of the probability density of the readings. With 60 readings, a gain of 0.1 per reading is "
-        "significant"
+        "logarithm of the probability density of the readings. With 60 readings, 0.1 per reading is significant"
     ),
     "reached": "runs in which the simulation reaches a steady state",
     "voltage_limit": "largest voltage of a proposed experiment, from `[motor]` of the robot file",
@@ -133,13 +124,13 @@ FLAGS = {
     "motor_overspeed": "the motor is above its permitted speed",
     "gearbox_overspeed": "the gearbox input is above its permitted speed",
     "winding_hot": "the winding gets too hot in long running at this current",
-    "slips": "the tracks or wheels slide faster than V_s on average",
+    "slips": "tracks or wheels slide faster than V_s on average",
     "jumps": "the robot leaves the ground at times",
-    "overvoltage": "cells are above their charge voltage, or the charging current is too high",
+    "overvoltage": "charge voltage or charging current of the cells is too high",
     "cut_off": "a cell is below its cut-off voltage",
     "battery_overcurrent": "the current of a cell is above its limit",
     "current_limited": "the motor driver limits the current",
-    "gearbox_overload": "the torque is above the continuous rating of the gearbox",
+    "gearbox_overload": "the torque is above the gearbox's continuous rating",
     "too_hot": "the winding is hotter than permitted",
     "demand_missed": "the commanded speed was not reached",
     "voltage_rising": "a cell voltage rises during discharge",

@@ -49,7 +49,7 @@ def calibration_document(
             catalogue.note("calibration.free"),
         ),
         (
-            *_over_rows(found, sized),
+            *_over_rows(found),
             *([voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),
             Section("Noise", tuple(_noise(found))),
@@ -95,7 +95,7 @@ def _noise(found: CalibrationResult) -> Iterable[Block]:
     yield Note(fit_tables.noise_sentence(noises, found.channels))
 
 
-def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
+def _over_rows(found: CalibrationResult) -> Iterable[Section]:
     """Sections: frequency response of a log, residuals over each condition."""
     table, panels = found.rows(), found.channels
     table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in panels}
@@ -103,9 +103,8 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
         runs = Runs(found.source, table, layout=Layout.of(found.robot))
         for figure in fit_tables.frequency_response(runs, panels, LINES):
             yield Section("Frequency response", (figure,))
-    along = {found.axis: "time [s]"} if found.axis else {}
-    figure = catalogue.figure("calibration.residuals", table, panels, along)
-    yield Section("Residuals against every condition", (figure,))
+    residuals = catalogue.figure("calibration.residuals", table, panels)
+    yield Section("Residuals against every condition", (residuals,))
 
 
 def feedforward_document(found: Feedforward) -> Document:

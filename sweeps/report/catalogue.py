@@ -32,7 +32,9 @@ def text(name: str, *words: Any) -> str:
     return sentence.format(*words) if words else sentence
 
 
-def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "") -> Figure:
+def figure(
+    name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "", suffix: str = ""
+) -> Figure:
     """Figure of the catalogue. Its drawing function is imported late, because importing matplotlib takes half a
     second.
 
@@ -42,6 +44,7 @@ def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (),
         finding: finding in words if it depends on the result.
         words: values to fill into the caption.
         more: text to append to the caption.
+        suffix: name of the drawn quantity, if there are several figures with this name.
     """
     entry = _entry(name)
     module, _, function = entry["draws"].rpartition(".")
@@ -50,7 +53,12 @@ def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (),
     def draw() -> Any:
         return getattr(importlib.import_module(module), function)(*drawn)
 
-    return Figure(name.partition(".")[2], finding or entry["finding"], text(name, *words) + more, draw)
+    return Figure(
+        name.partition(".")[2] + f"_{suffix}" * bool(suffix),
+        finding or entry["finding"],
+        text(name, *words) + more,
+        draw,
+    )
 
 
 def table(name: str, rows: Sequence[Sequence[Any]], *more: Column | str, **fields: Any) -> Table:

@@ -14,7 +14,7 @@ from calibration.data.requirements_file import Requirements
 from calibration.sizing import sheet
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import SizedDesign, SizingResult
-from calibration.sizing.sheet import ParameterChange, RequirementOutcome
+from calibration.sizing.sheet import RequirementOutcome
 from mmrjax.errors import count_noun
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
@@ -47,14 +47,22 @@ class CheckResult:
 
     def statement(self) -> str:
         """The answer: number of requirements that are met, and those missed by the largest share of their limits."""
-        number, missed = len(self.outcomes), sorted(self.missed, key=_margin_share)
+        number, missed = len(self.outcomes), self.missed
         if not missed:
             return f"All {number} requirements are met." if number > 1 else "The requirement is met."
-        verb = "is" if len(missed) == 1 else "are"
-        shortfalls = "; ".join(f"{requirement_label(o)} {shortfall_text(o)}" for o in missed[:NAMED])
-        others_text = f"; and {len(missed) - NAMED} more" if len(missed) > NAMED else ""
-        worst = ":" if len(missed) <= NAMED else ". Worst:"
-        return f"{len(missed)} of {number} requirements {verb} missed{worst} {shortfalls}{others_text}."
+        missed.sort(key=lambda o: -math.inf if o.margin is None else o.margin / max(abs(requirement_limit(o)), 1e-12))
+        parts = [
+            f"{requirement_label(o)} "
+            + (
+                f"({reached_value_text(o)})"
+                if o.margin is None
+                else f"{reached_value_text(o)}, required {required_value_text(o)}"
+            )
+            for o in missed[:NAMED]
+        ]
+        more = len(missed) - len(parts)
+        count = f"{len(missed)} of {number} requirements {'is' if len(missed) == 1 else 'are'} missed"
+        return f"{count}{'. Worst' * (more > 0)}: {'; '.join(parts)}{f'; and {more} more' if more > 0 else ''}."
 
     def to_json(self) -> Json:
         """`result.json`."""
@@ -67,18 +75,12 @@ class CheckResult:
         }
 
 
-def _margin_share(outcome: RequirementOutcome) -> float:
-    """Margin as a share of the limit [-]. -inf for a requirement without a value."""
-    return -math.inf if outcome.margin is None else outcome.margin / max(abs(requirement_limit(outcome)), 1e-12)
-
-
 def requirement_label(outcome: RequirementOutcome) -> str:
     """Name of a requirement, including its duty."""
-    point = outcome.at
-    duty = ""
-    if "duty" in point:
-        duty = f" {point['duty']}" + (f" {100 * point['share']:g} % of the time" if point["share"] else " still")
-    return f"{outcome.requirement.quantity.label}{duty}"
+    point, label = outcome.at, outcome.requirement.quantity.label
+    if "duty" not in point:
+        return label
+    return f"{label} {point['duty']}" + (f" {100 * point['share']:g} % of the time" if point["share"] else " still")
 
 
 def requirement_limit(outcome: RequirementOutcome) -> float:
@@ -101,13 +103,6 @@ def reached_value_text(outcome: RequirementOutcome) -> str:
         return f"{three_digits(outcome.value)} {quantity.unit}"
     no_turn = quantity.group == "turn" and outcome.status == STATUSES[NOT_SETTLED]
     return words.NO_TURN if no_turn else words.OUTCOMES.get(outcome.status) or words.status_meaning(outcome.status)
-
-
-def shortfall_text(outcome: RequirementOutcome) -> str:
-    """Value and its limit."""
-    if outcome.value is None or outcome.margin is None:
-        return f"({reached_value_text(outcome)})"
-    return f"{reached_value_text(outcome)}, required {required_value_text(outcome)}"
 
 
 _PLACES = {
@@ -133,13 +128,12 @@ SHOWN = 3
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
     """The report. `changes`: True if changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
-    sections = []
+    robot, sections = found.robot, []
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _blocks_of_changes(found), "changes"))
-    corners = [o.at for o in found.outcomes]
-    robot, figures = found.robot, [catalogue.figure("run.chart_of_corners", found.robot, corners)]
+    figures = [catalogue.figure("run.chart_of_corners", robot, [o.at for o in found.outcomes])]
     if float(robot.gearbox.efficiency_load) < 1 or run_tables.lost_by_load(robot):
-        volts = float(robot.battery.voltage_no_load(0.0))
+        volts = float(robot.battery.cells * robot.battery.voltage_no_load(0.0))
         figures.append(catalogue.figure("run.drive_plane", robot, volts, words=(volts,)))
     sections.append(Section("Motor and gear", tuple(figures)))
     blocks = Note(lead, "lead"), requirements_sheet(found.outcomes), catalogue.note("check.corners")
@@ -150,9 +144,11 @@ def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = 
     """Table of requirements with required and reached values, margins and worst corners."""
     rows = [
         (
-            Cell(*(("met", "good") if o.met else ("missed", "bad"))), requirement_label(o),
-            required_value_text(o), reached_value_text(o), _margin(o), worst_corner_text(o),
-            f"{o.at['configuration']}, {o.at['surface'].replace('_', ' ')}", o.requirement.source,
+            Cell(*(("met", "good") if o.met else ("missed", "bad"))), requirement_label(o), required_value_text(o),
+            reached_value_text(o),
+            None if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{three_digits(abs(o.margin))}",
+            worst_corner_text(o), f"{o.at['configuration']}, {o.at['surface'].replace('_', ' ')}",
+            o.requirement.source,
         )
         for o in outcomes
     ]  # fmt: skip
@@ -161,30 +157,23 @@ def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = 
 
 def _blocks_of_changes(found: CheckResult) -> tuple[Note | Table, ...]:
     """Table of the single changes that would meet a missed requirement."""
-    rows: list[tuple[object, ...]] = []
-    brief: list[int] = []
+    rows, brief, hopeless = list[tuple[object, ...]](), list[int](), list[str]()
     for o in found.missed:
+        requirement = f"{requirement_label(o)} {required_value_text(o)}"
         brief += range(len(rows), len(rows) + min(len(o.change), SHOWN))
-        rows += [(f"{requirement_label(o)} {required_value_text(o)}", *_change(c)) for c in o.change]
-    hopeless = [f"{requirement_label(o)} {required_value_text(o)}" for o in found.missed if not o.change]
-    others_text = f", {len(rows) - len(brief)} more in result.json" if len(rows) > len(brief) else ""
-    title = f"changes of a single parameter that would meet them{others_text}"
+        for c in o.change:
+            unit = f"C ({c.after / COULOMB_PER_MAH:.0f} mAh)" if c.unit == "C" else c.unit
+            percent, breaks = 100 * (c.after / c.before - 1), ", ".join(c.breaks) or "nothing more"
+            rows.append((requirement, f"`{c.parameter}`", c.before, c.after, unit, percent, breaks))
+        hopeless += [requirement] * (not o.change)
+    more = f", {len(rows) - len(brief)} more in result.json" if len(rows) > len(brief) else ""
+    title = f"changes of a single parameter that would meet them{more}"
     hopeless_sentence = f"No change of a single parameter within its bounds meets {', '.join(hopeless)}."
     return (
         catalogue.note("check.changes"),
         catalogue.table("check.change", rows, title=title, brief=brief),
-        *([Note(hopeless_sentence, terminal=True)] if hopeless else []),
-    )  # fmt: skip
-
-
-def _change(c: ParameterChange) -> tuple[object, ...]:
-    breaks = ", ".join(c.breaks) or "nothing more"
-    unit = f"C ({c.after / COULOMB_PER_MAH:.0f} mAh)" if c.unit == "C" else c.unit
-    return f"`{c.parameter}`", c.before, c.after, unit, 100 * (c.after / c.before - 1), breaks
-
-
-def _margin(o: RequirementOutcome) -> str | None:
-    return None if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{three_digits(abs(o.margin))}"
+        *[Note(hopeless_sentence, terminal=True)] * bool(hopeless),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,13 +199,15 @@ class SizeResult:
         s = self.sizing
         left_out = f" No parts meet the requirement on {' or '.join(s.unmeetable)} (dropped)." if s.unmeetable else ""
         if s.best is None:
-            nearest = min(s.motors.values(), key=margin_shortfall, default=None)
-            why = (
+
+            def shortfall(f: SizedDesign) -> float:
+                return sum(max(-m, 0.0) for m in f.margins.values())
+
+            nearest = min(s.motors.values(), key=shortfall, default=None)
+            why = "" if nearest is None else (
                 f" The nearest, {describe_design(nearest)}, misses {', '.join(missed_limits(nearest))}."
-                if nearest
-                else ""
-            )
-            return f"No design with these parts meets the requirements.{why}{left_out}"
+            )  # fmt: skip
+            return f"{catalogue.text('size.none')}{why}{left_out}"
         missing = [requirement_label(o) for o in self.outcomes if not (o.met or requirement_label(o) in s.unmeetable)]
         binds = f" Binding limits: {', '.join(s.best.binds) or 'none'}."
         binds += f" It misses {', '.join(missing)}." if missing else ""
@@ -238,11 +229,6 @@ class SizeResult:
 def design_verdict(found: SizedDesign, unmeetable: Names) -> str:
     """Verdict on a design. `unmeetable`: requirements that no choice of parts meets, which were ignored."""
     return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
-
-
-def margin_shortfall(found: SizedDesign) -> float:
-    """Sum of the margins that a design misses [-]."""
-    return sum(max(-m, 0.0) for m in found.margins.values())
 
 
 def missed_limits(found: SizedDesign) -> list[str]:
@@ -274,7 +260,6 @@ COLUMNS = columns(
 
 #: Number of motors in the table of a terminal, and of further designs in its few lines.
 ALTERNATIVES, NEXT = 5, 2
-_DESIGNS = "The best design, and the best with other parts, all with makers' gear ratios and whole cells."
 
 
 def size_document(found: SizeResult, robot_name: str) -> Document:
@@ -285,33 +270,30 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
         f"{s.evaluated:,} designs were evaluated."
     )
     best = () if s.best is None else (s.best, *s.alternatives)
-    about = _DESIGNS if best else "No design with these parts meets the requirements."
+    about = catalogue.note("size.designs" if best else "size.none")
     tables = _table("best", found, best), requirements_sheet(found.outcomes, terminal=False)
     motors = _table("by_motor", found, s.motors.values(), "best design of each motor, the first five", terminal=True)
     designs = [f"{describe_design(f)} ({objective_text(f, s.objective)})" for f in s.alternatives]
-    front_words = _front_in_words(found)
-    front = [b for x in front_words for b in (Note(x, terminal=True), _table("front", found, s.front))]
     next_best = (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
+    front_words: Names = ()
+    if s.front:
+        (first, second), (low, *_, high) = found.objectives, (s.front[0], *s.front)
+        front_words = (
+            f"{count_noun(len(s.front), 'design')} on the Pareto front of {first} and {second}, from "
+            f"{objective_text(low, first)} to {objective_text(high, second)}.",
+        )
+    front = [b for x in front_words for b in (Note(x, terminal=True), _table("front", found, s.front))]
+    sections = [
+        Section("Designs", (about, *tables), "designs"),
+        Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
+    ]
+    if s.best is not None:
+        chart = catalogue.figure("run.chart_of_corners", s.best.robot, [o.at for o in found.outcomes])
+        sections.append(Section("Motor and gear", (chart,)))
     return Document(
-        "Sizing",
-        found.statement(),
-        (Note(lead, "lead"), *front),
-        (
-            Section("Designs", (Note(about), *tables), "designs"),
-            Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
-            *_chart(found),
-        ),
+        "Sizing", found.statement(), (Note(lead, "lead"), *front), tuple(sections),
         brief=(lead, *next_best, *front_words),
-    )
-
-
-def _chart(found: SizeResult) -> tuple[Section, ...]:
-    """Chart of motor and gear for the best design, if there is one."""
-    best = found.sizing.best
-    if best is None:
-        return ()
-    corners = [o.at for o in found.outcomes]
-    return (Section("Motor and gear", (catalogue.figure("run.chart_of_corners", best.robot, corners),)),)
+    )  # fmt: skip
 
 
 def _table(
@@ -329,15 +311,3 @@ def _table(
         for f in designs
     ]  # fmt: skip
     return Table(name, COLUMNS, rows, title, terminal=terminal, brief=range(min(ALTERNATIVES, len(rows))))
-
-
-def _front_in_words(found: SizeResult) -> Names:
-    """A sentence on the Pareto front, none without one."""
-    front = found.sizing.front
-    if not front:
-        return ()
-    first, second = found.objectives
-    return (
-        f"{count_noun(len(front), 'design')} on the Pareto front of {first} and {second}, from "
-        f"{objective_text(front[0], first)} to {objective_text(front[-1], second)}.",
-    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from jaxtyping import Array
 from calibration.data import Columns, Json, Names
 from calibration.data.robot_file import RobotFile
 from mmrjax.climbing.climb_derivatives import OUTPUTS, ClimbDerivatives, ClimbInputs, outputs_of_run
-from mmrjax.climbing.climb_simulation import LOSSES, NAMES, OVER, SOURCES, ClimbRuns
+from mmrjax.climbing.climb_simulation import LOSSES, NAMES, SOURCES, ClimbRuns
 from mmrjax.climbing.footing import FRONT, PITCH, REAR, SHAFT
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model.robot import Robot
@@ -100,11 +100,6 @@ class ClimbResult:
         """Outcome of the run shown."""
         return NAMES[int(self.climb.verdict[0])]
 
-    @property
-    def over(self) -> bool:
-        """True if the robot got over the obstacle."""
-        return int(self.climb.verdict[0]) == OVER
-
     @functools.cached_property
     def table(self) -> Columns:
         """Table of the run over time."""
@@ -151,19 +146,18 @@ class ClimbResult:
     @property
     def slopes(self) -> list[Json] | None:
         """Derivatives, one row for each output and variable. None unless requested."""
-        variables, derivatives = self.along, self.derivatives
-        if variables is None or derivatives is None:
+        variables, d = self.along, self.derivatives
+        if variables is None or d is None:
             return None
-        variable_keys = ("by", "by_unit", "by_value", "by_width")
-        names = ("output", "unit", "value", *variable_keys, "derivative", "slope", "slope_sd")
-        found_by = {
-            name: (derivatives.by[name], derivatives.slope[name], derivatives.slope_sd[name]) for name in OUTPUTS
-        }
         return [
-            dict(zip(names, (n, unit, derivatives.found[n], *row, *(float(x[k]) for x in found_by[n])), strict=True))
-            for n, (unit, _) in OUTPUTS.items()
-            for k, row in enumerate(variables.rows)
-        ]
+            {
+                "output": name, "unit": unit, "value": d.found[name], "by": by, "by_unit": by_unit, "by_value": value,
+                "by_width": width, "derivative": float(d.by[name][k]), "slope": float(d.slope[name][k]),
+                "slope_sd": float(d.slope_sd[name][k]),
+            }
+            for name, (unit, _) in OUTPUTS.items()
+            for k, (by, by_unit, value, width) in enumerate(variables.rows)
+        ]  # fmt: skip
 
     def statement(self) -> str:
         """The answer in one sentence."""
@@ -176,7 +170,7 @@ class ClimbResult:
             why = "" if next_larger is None else f"; at {next_larger[0]:.0f} mm it {VERDICTS[next_larger[1]][0]}"
             return f"The largest {self.sought} that it gets over is {self.largest:.0f} mm{why}."
         short, meaning = VERDICTS[self.verdict]
-        return f"The robot {short}: {self.obstacle}" + ("." if self.over else f"; {meaning}.")
+        return f"The robot {short}: {self.obstacle}" + ("." if self.verdict == "over" else f"; {meaning}.")
 
     def numbers(self) -> dict[str, float]:
         """Largest and final numbers of the run that is shown."""
@@ -233,11 +227,11 @@ def climb_document(found: ClimbResult, file: RobotFile) -> Document:
 
 
 def _sections(found: ClimbResult) -> Iterable[Section]:
-    numbers = [
-        (name.rpartition("_")[0].replace("_most", ", largest").replace("_least", ", least").replace("_", " "), value,
-         name.rpartition("_")[2])
-        for name, value in found.numbers().items()
-    ]  # fmt: skip
+    numbers = []
+    for name, value in found.numbers().items():
+        words, _, unit = name.rpartition("_")
+        words = words.replace("_most", ", largest").replace("_least", ", least").replace("_", " ")
+        numbers.append((words, value, unit))
     of_run = catalogue.table("climb.run", numbers)
     yield Section("The run in numbers", (of_run, catalogue.note("climb.belts")), "numbers")
     if found.margins:
@@ -245,21 +239,16 @@ def _sections(found: ClimbResult) -> Iterable[Section]:
         shares = catalogue.table("climb.shares", rows)
         yield Section("Margins", (shares, catalogue.note("climb.least")), "margins")
     if found.along is not None:
-        yield Section(
-            "Derivatives", (_derivatives(found, found.along), catalogue.note("climb.slopes")), "derivatives"
-        )
+        derivatives = _derivatives(found.slopes or [], found.along)
+        yield Section("Derivatives", (derivatives, catalogue.note("climb.slopes")), "derivatives")
 
 
-def _derivatives(found: ClimbResult, along: Along) -> Table:
-    derivatives, names = found.derivatives, list(OUTPUTS)
-    assert derivatives is not None  # it was asked for
-    parts = derivatives.by, derivatives.slope, derivatives.slope_sd
-    rows = [
-        (
-            n if OUTPUTS[n][0] == "-" else f"{n} [{OUTPUTS[n][0]}]", derivatives.found[n],
-            *(f"{d:.3g} ({s:.3g} ± {sd:.1g})" for d, s, sd in zip(*(x[n] for x in parts), strict=True))
-        )
-        for n in names
-    ]  # fmt: skip
-    variable_rows = (f"by {n} = {v:.4g} {u}, over ±{w:.2g} |".replace(" ,", ",") for n, u, v, w in along.rows)
-    return catalogue.table("climb.slopes-table", rows, *variable_rows, brief=[names.index(n) for n in SHOWN])
+def _derivatives(slopes: Sequence[Json], along: Along) -> Table:
+    rows: dict[str, list[Any]] = {}
+    for s in slopes:
+        label = s["output"] if s["unit"] == "-" else f"{s['output']} [{s['unit']}]"
+        cells = rows.setdefault(s["output"], [label, s["value"]])
+        cells.append(f"{s['derivative']:.3g} ({s['slope']:.3g} ± {s['slope_sd']:.1g})")
+    heads = (f"by {n} = {v:.4g} {u}, over ±{w:.2g} |".replace(" ,", ",") for n, u, v, w in along.rows)
+    brief = [k for k, name in enumerate(rows) if name in SHOWN]
+    return catalogue.table("climb.slopes-table", list(rows.values()), *heads, brief=brief)

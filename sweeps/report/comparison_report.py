@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -17,8 +15,7 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from sweeps.pages import words
 from sweeps.report import catalogue, fit_tables
-from sweeps.report.document import Cell, Column, Document, Note, Section, Table, is_missing, remarks
-from sweeps.report.run_tables import condition_formats
+from sweeps.report.document import Cell, Document, Note, Section, is_missing, remarks
 
 #: Group → channel → rows, rms_percent, max_percent, rms, unit (of the rms), r2, missing.
 Summary = dict[str, dict[str, Json]]
@@ -37,9 +34,9 @@ class Comparison:
         robot_name: robot name of the simulated robot.
         fit: `these` if the robot was fitted to these rows, `others` if it was fitted to other rows, "" if no fit is
             recorded.
-        over: further columns of histories, over which errors are drawn, with their headings.
         notes: sentences on the table.
         against: name of a second robot, "" for none. Its readings are the columns `against_<column>` of the table.
+        sampled: True for time histories.
         after_steps: rows of histories at or after a step of the command.
     """
 
@@ -50,24 +47,10 @@ class Comparison:
     model: str
     robot_name: str
     fit: str = ""
-    over: Mapping[str, str] | None = None
     notes: Names = ()
     against: str = ""
+    sampled: bool = False
     after_steps: np.ndarray | None = None
-
-    @property
-    def rms_of_both(self) -> dict[str, tuple[int, float, float]]:
-        """For each channel, the rows with values of both robots, and their rms errors [% of the measured rms]."""
-        answer = {}
-        for channel in self.channels:
-            readings_of_both = np.stack(
-                [self.table[prefix + channel.column] for prefix in ("simulated_", "against_")], 1
-            )
-            measured = self.table[channel.column]
-            rows = np.isfinite(readings_of_both).all(1) & np.isfinite(measured)
-            first, second = 100 * residual.share_of_measured(readings_of_both[rows], measured[rows, None])
-            answer[channel.name] = int(rows.sum()), float(first), float(second)
-        return answer
 
 
 def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = None) -> tuple[Columns, Summary]:
@@ -112,24 +95,16 @@ def _summary(channel: Channel, table: Columns) -> Json:
     }
 
 
-_FITS = {
-    "these": "This robot was fitted to these rows: errors are not predictions.",
-    "others": "This robot was fitted to other rows: errors are predictions.",
-    "": "",
-}
-
-
 def comparison_document(found: Comparison) -> Document:
     """Report of a comparison."""
-    table = found.table, found.channels
+    table, status = found.table, found.table["status"]
     lead = (
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
-        f"{count_noun(len(found.table['status']), 'row')}."
+        f"{count_noun(len(status), 'row')}."
     )
-    known_sd = any(np.isfinite(found.table.get(c.sd_column, [])).any() for c in found.channels)
+    known_sd = any(np.isfinite(table.get(c.sd_column, [])).any() for c in found.channels)
     band = " Band: ±2 standard deviations of the readings." * known_sd
-    errors = catalogue.figure("comparison.errors", *table, found.over, more=band)
-    status = found.table["status"]
+    errors = catalogue.figure("comparison.errors", table, found.channels, more=band)
     rows = []
     groups = dict(list(found.summary.items())[: None if len(found.summary) > 2 else 1])  # one equals the total
     for group, by_channel in groups.items():
@@ -137,21 +112,19 @@ def comparison_document(found: Comparison) -> Document:
             e = by_channel[channel.name]
             rms = None if is_missing(e["rms"]) else f"{e['rms']:.{channel.resolution}f} {channel.unit}"
             rows.append((group, channel.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
+    ends = [
+        f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; {words.status_meaning(name)}."
+        for name, count in Counter(map(str, status)).items()
+        if name not in words.SETTLED
+    ]
+    marks = [Cell(words.short_status(s), "" if s in words.SETTLED else "slides") for s in map(str, status)]
+    kinds = {"": "measured", "simulated_": "simulated"}
     return Document(
         f"{found.robot_name} against {found.source}",
         comparison_answer(found),
         (
             Note(lead, "lead"),
-            *(
-                Note(
-                    f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; "
-                    f"{words.status_meaning(name)}.",
-                    "warn",
-                    terminal=True,
-                )
-                for name, count in Counter(map(str, status)).items()
-                if name not in words.SETTLED
-            ),
+            *(Note(text, "warn", terminal=True) for text in ends),
             catalogue.table("comparison.errors", rows),
             catalogue.note("comparison.errors-note"),
             *remarks(found.notes),
@@ -159,25 +132,28 @@ def comparison_document(found: Comparison) -> Document:
         (
             *_over_time(found),
             Section("Errors against conditions", (errors,)),
-            Section("Rows", (_rows(found),)),
+            fit_tables.rows_section(
+                table, found.channels, kinds, True, mass=True, last={"status": marks}, file="comparison.csv",
+                terminal=True,
+            ),
         ),
-    )
+    )  # fmt: skip
 
 
 def _over_time(found: Comparison) -> tuple[Section, ...]:
     """Section with the readings of a log over time. None for a table of settled runs."""
-    if found.over is None:
+    if not found.sampled:
         return ()
-    lines = {"simulated_": found.robot_name, "against_": found.against}
-    if not found.against:
-        lines = {"simulated_": "simulated"}
-    answer = comparison_answer(found)
+    lines = {"simulated_": "simulated"}
+    if found.against:
+        lines = {"simulated_": found.robot_name, "against_": found.against}
     fits = fit_tables.fits_of_runs(found.table, found.channels, lines)
     if found.after_steps is not None and 0 < np.count_nonzero(found.after_steps) < len(found.after_steps):
         rest = {column: values[~found.after_steps] for column, values in found.table.items()}
         apart = {prefix: f"{name}, without the two samples after each step" for prefix, name in lines.items()}
         rows = [*fits.rows, *fit_tables.fits_of_runs(rest, found.channels, apart).rows]
         fits = dataclasses.replace(fits, rows=sorted(rows, key=lambda row: row[0]))
+    answer = comparison_answer(found)
     overlay = catalogue.figure("fit.overlay", found.table, found.channels, lines, finding=answer)
     return (Section("Over time", (overlay, fits)),)
 
@@ -185,45 +161,31 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
 def comparison_answer(found: Comparison) -> str:
     """The rms errors with their numbers of rows, the worst reading, and if the robot was fitted to these rows."""
     error_summary, total = found.summary["all"], len(found.table["status"])
-    channel_errors = [(c, error_summary[c.name]) for c in found.channels if error_summary[c.name]["rows"]]
+    channel_errors = {c.label: error_summary[c.name] for c in found.channels if error_summary[c.name]["rows"]}
     if not channel_errors:
         return "No row has a simulated and a measured value."
-    errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in channel_errors)
-    rows, worst = max(e["rows"] for _, e in channel_errors), max(e["max_percent"] for _, e in channel_errors)
+    errors = ", ".join(f"{e['rms_percent']:.1f} % {label}" for label, e in channel_errors.items())
+    rows, worst = (max(e[name] for e in channel_errors.values()) for name in ("rows", "max_percent"))
     extent_words = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
-    if found.over is not None:
-        time = found.table["time_s"]
-        runs = found.table.get("run_id", np.zeros(len(time)))
-        extent_words = f"{sum(np.ptp(time[runs == name]) for name in np.unique(runs)):.3g} s of log"
-    sentence = f"{extent_words}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
-    return sentence if not found.against else f"{sentence} {_second_robot(found)}"
+    if found.sampled:
+        runs = Runs(found.source, {k: found.table[k] for k in ("run_id", "time_s") if k in found.table})
+        extent_words = f"{sum(np.ptp(runs['time_s'][r]) for r in runs.rows_by_run().values()):.3g} s of log"
+    parts = [f"{extent_words}: rms error {errors} (worst reading {worst:.1f} %)."]
+    parts += [catalogue.text(f"comparison.{found.fit}")] if found.fit else []
+    return " ".join([*parts, *([_second_robot(found)] if found.against else [])])
 
 
 def _second_robot(found: Comparison) -> str:
     """Errors of both robots on the rows for which both have values."""
-    rms_pair = found.rms_of_both
-    shared = max(rows for rows, _, _ in rms_pair.values())
-    if not shared:
-        return f"No row has values for both this robot and {found.against}."
-    parts = [
-        f"{c.label} {rms_pair[c.name][1]:.1f} and {rms_pair[c.name][2]:.1f} %"
-        for c in found.channels
-        if rms_pair[c.name][0]
-    ]
-    return f"This robot and {found.against} on the same {count_noun(shared, 'row')}: {', '.join(parts)}."
-
-
-def _rows(found: Comparison) -> Table:
-    table, formats = found.table, condition_formats(found.table, mass=True)
-    heads = [Column("configuration"), *(Column(heading, form=form) for heading, form in formats.values())]
-    heads.append(Column("status"))
-    cells: list[Any] = [table["configuration"], *(table[c] for c in formats)]
-    ends = [(s, "" if s in words.SETTLED else "slides") for s in map(str, table["status"])]
-    cells.append([Cell(words.short_status(s), look) for s, look in ends])
+    parts, most = [], 0
     for c in found.channels:
-        measured, simulated = table[c.column], table[f"simulated_{c.column}"]
-        form = f"{{:.{max(c.resolution - 1, 0)}f}}"
-        heads += [Column(name, c.unit, form, c.label, terminal=False) for name in ("measured", "simulated")]
-        heads.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
-        cells += [measured, simulated, simulated - measured]
-    return Table("rowtable", tuple(heads), list(zip(*cells, strict=True)), file="comparison.csv", wide=True)
+        both = np.stack([found.table[prefix + c.column] for prefix in ("simulated_", "against_")], 1)
+        measured = found.table[c.column]
+        rows = np.isfinite(both).all(1) & np.isfinite(measured)
+        if rows.any():
+            first, second = 100 * residual.share_of_measured(both[rows], measured[rows, None])
+            parts.append(f"{c.label} {first:.1f} and {second:.1f} %")
+            most = max(most, int(rows.sum()))
+    if not parts:
+        return f"No row has values for both this robot and {found.against}."
+    return f"This robot and {found.against} on the same {count_noun(most, 'row')}: {', '.join(parts)}."

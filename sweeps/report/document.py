@@ -73,7 +73,7 @@ class Column:
 
     def text(self, cell: Any) -> str:
         """Text of a cell, for page and terminal. A missing number is a dash."""
-        value = cell.value if isinstance(cell, Cell) else cell
+        value = cell_value(cell)
         if is_missing(value):
             return DASH
         if self.form and isinstance(value, int | float | np.number):
@@ -165,11 +165,11 @@ class Table:
         """The table as CSV with all digits. Missing numbers are empty cells."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(cell_text(plain_text(column.full_title)) for column in self.columns)
-        for row in self.rows:
-            bare = (cell.value if isinstance(cell, Cell) else cell for cell in row)
-            texts = (plain_text(v) if isinstance(v, str) else v for v in bare)
-            writer.writerow("" if is_missing(v) else cell_text(v) if isinstance(v, str) else v for v in texts)
+        for row in ([column.full_title for column in self.columns], *self.rows):
+            values = map(cell_value, row)
+            writer.writerow(
+                cell_text(plain_text(v)) if isinstance(v, str) else "" if is_missing(v) else v for v in values
+            )
         return stream.getvalue()
 
 
@@ -241,6 +241,11 @@ class Document:
 def cell_tone(cell: Any) -> str:
     """Tone of a cell, "" for a plain value."""
     return cell.tone if isinstance(cell, Cell) else ""
+
+
+def cell_value(cell: Any) -> Any:
+    """Value of a cell, with or without a tone."""
+    return cell.value if isinstance(cell, Cell) else cell
 
 
 def is_missing(value: Any) -> bool:

@@ -11,7 +11,7 @@ from mmrjax import __version__
 from mmrjax.errors import count_noun, printable
 from mmrjax.model import channels
 from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
-from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, EffectFate
+from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE
 from sweeps.export.formats import FORMATS, Export
 from sweeps.export.joint import INSIDE
 from sweeps.export.law_source import filled_template, jax_source, module_from_source
@@ -25,34 +25,40 @@ TONES = {HELD: "good", APPROXIMATED: "fair", DROPPED: "bad"}
 def export_document(found: Export) -> Document:
     """Report of an exported drive."""
     compared = found.comparison
-    usage = USE[found.format].format(name=found.joint.name, at="drive", armature=rotor_inertia(found))
-    fate_rows = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
-    fates = catalogue.table("export.fates", fate_rows)
+    fates = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
+    rim = catalogue.note("export.rim", errors_title(found).capitalize())
+    kept = catalogue.table("export.fates", fates), catalogue.note("export.kept")
     sections = [
-        Section("What the format represents", (fates, catalogue.note("export.kept")), "holds"),
-        Section(
-            "Errors",
-            (_errors(found), catalogue.note("export.rim", errors_title(found).capitalize())),
-            "errors",
-        ),
+        Section("What the format represents", kept, "holds"),
+        Section("Errors", (_errors(found), rim), "errors"),
     ]
     if compared.refitted:
-        fitted = [(n, compared.translated[n], v) for n, v in compared.refitted.items()]
-        table = catalogue.table("export.fitted", fitted)
+        table = catalogue.table("export.fitted", _fitted(found))
         sections.append(Section("Parameters of the format", (table, catalogue.note("export.fitted"))))
     if found.checks:
-        checks = catalogue.table("export.checks", list(found.checks.items()))
-        sections.append(Section("Checks of the files", (checks,)))
-    conditions = (
-        Note(tuple(conditions_seen(found)), name="seen"),
-        Note(tuple(not_tested(found)), name="untested"),
-    )
+        sections.append(Section("Checks of the files", (catalogue.table("export.checks", [*found.checks.items()]),)))
+    rows = [(f"`{c.name}`", c.value, c.unit, c.interval or None, c.meaning, c.source) for c in found.constants]
+    conditions = Note(tuple(conditions_seen(found)), name="seen"), Note(tuple(not_tested(found)), name="untested")
     return Document(
         f"{found.joint.file.name} for {found.format}",
         export_statement(found),
-        (Note(usage, "lead"), *remarks(export_remarks(found))),
-        (*sections, _constants(found), Section("Conditions in the data, and what was not tested", conditions)),
+        (Note(_usage(found), "lead"), *remarks(export_remarks(found))),
+        (
+            *sections,
+            Section("Constants", (catalogue.table("export.constants", rows),)),
+            Section("Conditions in the data, and what was not tested", conditions),
+        ),
     )
+
+
+def _usage(found: Export) -> str:
+    """Use of the format's files, as a paragraph."""
+    return catalogue.text(f"export.use-{found.format}", found.joint.name, rotor_inertia(found))
+
+
+def _fitted(found: Export) -> list[tuple[str, float, float]]:
+    """Parameters of the format: name, translated and refitted value."""
+    return [(n, found.comparison.translated[n], v) for n, v in found.comparison.refitted.items()]
 
 
 def _errors(found: Export) -> Table:
@@ -63,46 +69,6 @@ def _errors(found: Export) -> Table:
     return catalogue.table("export.error-table", rows, *heads, title=errors_title(found))
 
 
-def _constants(found: Export) -> Section:
-    rows = [(f"`{c.name}`", c.value, c.unit, c.interval or None, c.meaning, c.source) for c in found.constants]
-    return Section("Constants", (catalogue.table("export.constants", rows),))
-
-
-#: Use of a file of each format, as a paragraph of LAW.md.
-USE = {
-    "mujoco": (
-        'Put `<include file="drive.xml"/>` before `<worldbody>` of your model and `class="{name}_drive"` on the '
-        "joint. The control is the voltage at the driver's output: duty times supply voltage. `scene.xml` runs as it "
-        "is: `python -m mujoco.viewer --mjcf=scene.xml`, key frame `run`."
-    ),
-    "jax": (
-        "`from actuator import PARAMS, actuator, initial_state`, or without any source "
-        '`jax.export.deserialize(open("actuator.jaxexport", "rb").read()).call`, in single precision, for arrays of '
-        "joints. Add the torque to `qfrc_applied` of the joint at each step, and set the joint's armature to "
-        "`armature(PARAMS)` once."
-    ),
-    "onnx": (
-        "Inputs are the state, `command` [V], `joint_position` [rad], `joint_velocity` [rad/s], each of shape "
-        "(joints,), and `dt` [s] of shape (1,). Outputs are `torque` [N·m], the next state, and the power taken [W]. "
-        "The state at rest is 0. All numbers are single precision. The joint needs the rotor's inertia as armature: "
-        "{armature:.4g} kg·m²."
-    ),
-    "mjlab": (
-        '`from mjlab_actuator import DriveActuatorCfg`, then `DriveActuatorCfg(target_names_expr=("{at}",))` '
-        "among the actuators of an entity. The effort target is the voltage [V]. It was tested with a stand-in "
-        "for mjlab."
-    ),
-    "table": (
-        "Read the voltage for a speed and a torque of the joint, and divide by the supply's voltage to get the "
-        "duty. Add inertia · acceleration of the rotating parts to the torque: the rotor has {armature:.4g} "
-        "kg·m² at the joint."
-    ),
-    "randomization": (
-        '`numpy.load("draws.npz")`: each array has one value per sample. Use all values of one sample '
-        "together, since they are correlated. `mujoco/…` are attributes of `drive.xml` as the format mujoco "
-        "writes it. `actuator/…` are keys of `PARAMS`."
-    ),
-}
 #: Readings that a controller compares with its setpoint, their units, and the last term of its duty.
 GOALS = {
     "goal_angle": ("angle", "rad", "- K_d ω"),
@@ -133,11 +99,6 @@ def export_statement(found: Export) -> str:
     )
 
 
-def share_kept(fate: EffectFate) -> str:
-    """Share of an effect that is kept, in percent, empty if it was not computed."""
-    return f"{100 * fate.kept:.0f} %" if np.isfinite(fate.kept) else ""
-
-
 def errors_title(found: Export) -> str:
     """Title of the table of errors."""
     compared = found.comparison
@@ -145,22 +106,20 @@ def errors_title(found: Export) -> str:
 
 
 def export_remarks(found: Export) -> list[str]:
+    """Remarks on the reference of the errors, and on what is not exported."""
     compared, drive = found.comparison, found.joint
-    said = []
-    if not compared.situation.is_measured:
-        said.append("the reference is the native model. Give measured runs with --data")
-    else:
-        said.append(
+    answer = ["the reference is the native model. Give measured runs with --data"]
+    if compared.situation.is_measured:
+        answer = [
             "the refit used no measurements. Errors are hold-out errors unless the robot was fitted to these runs"
-        )
-    dropped_names = [f.name for f in compared.fates if f.verdict == DROPPED]
-    if dropped_names:
-        said.append(f"dropped: {', '.join(dropped_names)}")
+        ]
+    if dropped := [f.name for f in compared.fates if f.verdict == DROPPED]:
+        answer.append(f"dropped: {', '.join(dropped)}")
     if drive.idle:
-        said.append(f"{', '.join(drive.idle)}: not exported: no effect in {drive.configuration}")
+        answer.append(f"{', '.join(drive.idle)}: not exported: no effect in {drive.configuration}")
     if found.posterior is None and drive.file.source.endswith(".toml"):
-        said.append("no posterior.nc next to the robot's file: intervals come from the priors")
-    return said
+        answer.append("no posterior.nc next to the robot's file: intervals come from the priors")
+    return answer
 
 
 def conditions_seen(found: Export) -> list[str]:
@@ -211,7 +170,7 @@ def law_text(found: Export) -> str:
     """Text of LAW.md."""
     drive, compared = found.joint, found.comparison
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
-    shares = {f.name: share_kept(f) for f in compared.fates}
+    shares = {f.name: f"{100 * f.kept:.0f} %" if np.isfinite(f.kept) else "" for f in compared.fates}
     sections = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
                 "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
     effects = [p for p in drive.parts if p.effect and p.balance in INSIDE]
@@ -221,7 +180,7 @@ def law_text(found: Export) -> str:
         origin=escape_markdown(f"{drive.file.name}, {drive.configuration}"),
         version=__version__,
         format=FORMATS[found.format],
-        use=USE[found.format].format(name=drive.name, at="drive", armature=rotor_inertia(found)),
+        use=_usage(found),
         format_name=found.format,
         joint=drive,
         ground=drive.robot.has_ground,
@@ -236,7 +195,7 @@ def law_text(found: Export) -> str:
         mesh_damping=MESH_DAMPING,
         constants=[(c, escape_markdown(c.name), escape_markdown(c.source)) for c in found.constants],
         cited=any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants),
-        refitted=[(n, compared.translated[n], v) for n, v in compared.refitted.items()],
+        refitted=_fitted(found),
         fates=[(f.name, verdicts[f.verdict], f.how, shares[f.name]) for f in compared.fates],
         errors_title=errors_title(found).capitalize(),
         channels=[f"{channels.find_channel(n).label} [%]" for n in compared.errors[NATIVE]],

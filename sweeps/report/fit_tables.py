@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,9 +15,9 @@ from calibration.data.runs import Runs
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import r_squared
 from mmrjax.model.channels import Channel
-from sweeps.report import catalogue, run_tables
+from sweeps.report import catalogue
 from sweeps.report.document import Cell, Column, Figure, Section, Table, remarks
-from sweeps.report.run_tables import condition_formats
+from sweeps.report.run_tables import condition_columns, reading_form
 
 #: Fewest rows of a log for a frequency response.
 FREQUENCIES = 64
@@ -109,32 +111,40 @@ def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]
 
 
 def rows_section(
-    table: Columns, shown: Sequence[Channel], kinds: Mapping[str, str], sized: bool, **more: Any
+    table: Columns,
+    shown: Sequence[Channel],
+    kinds: Mapping[str, str],
+    sized: bool,
+    *,
+    mass: bool = False,
+    first: Mapping[str, Any] = MappingProxyType({}),
+    last: Mapping[str, Any] = MappingProxyType({}),
+    **fields: Any,
 ) -> Section:
     """Section with all rows: conditions, readings, and the error of the last kind of readings.
 
     Args:
         kinds: description of each kind of readings, by the prefix of its columns.
-        more: lists of `first` and `last` columns.
         sized: True if errors are in the channel's unit instead of percent.
+        mass: True to include the total mass.
+        first, last: further cells, by the heading of their column.
+        fields: further fields of the table.
     """
-    conditions = condition_formats(dict(table))
-    heads = [Column(word) for word in more.get("first", {})] + [Column("configuration")]
-    cells: list[Any] = [*more.get("first", {}).values(), table["configuration"]]
-    for column, (heading, form) in conditions.items():
-        heads.append(Column(heading, form=form))
-        cells.append(table[column])
-    last = list(kinds)[-1]
+    cells = [(Column(word), values) for word, values in ({**first, "configuration": table["configuration"]}).items()]
+    cells += [(column, table[name]) for name, column in condition_columns(table, mass=mass).items()]
+    *_, simulated = kinds
     for c in shown:
-        for key, head in run_tables.reading_columns((c,), kinds):
-            heads.append(head)
-            cells.append(table[key])
+        reading = Column("", c.unit, reading_form(c), c.label, terminal=False)
+        cells += [
+            (dataclasses.replace(reading, heading=heading), table[prefix + c.column])
+            for prefix, heading in kinds.items()
+        ]
         if sized:
-            heads.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
-            cells.append(table[f"{last}{c.column}"] - table[c.column])
+            errors = table[simulated + c.column] - table[c.column]
+            cells.append((Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label), errors))
         elif f"error_{c.name}_percent" in table:
-            heads.append(Column("error", "%", "{:+.1f}", c.label))
-            cells.append([error_cell(float(e)) for e in table[f"error_{c.name}_percent"]])
-    heads += [Column(word) for word in more.get("last", {})]
-    rows = list(zip(*cells, *more.get("last", {}).values(), strict=True))
-    return Section("Rows", (catalogue.table("fit.rowtable", rows, *heads),))
+            shares = [error_cell(float(e)) for e in table[f"error_{c.name}_percent"]]
+            cells.append((Column("error", "%", "{:+.1f}", c.label), shares))
+    cells += [(Column(word), values) for word, values in last.items()]
+    heads, values = zip(*cells, strict=True)
+    return Section("Rows", (catalogue.table("fit.rowtable", list(zip(*values, strict=True)), *heads, **fields),))

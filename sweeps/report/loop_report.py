@@ -7,9 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from calibration.data import Columns, Names
+from calibration.data import Columns
 from calibration.data.columns import Layout
 from calibration.described import as_paragraph, describe
 from calibration.discovery.experiments import NONE
@@ -40,45 +38,79 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         robot_name: name or file of the initial robot.
         changes: changes of settled runs by each effect.
     """
-    missing, table = found.verdict not in ("none", "undescribed"), rows_for_figures(found)
-    shifts, added = list(moved_parameters(found)), list(_effect_findings(found, changes))
+    table, shifts = rows_for_figures(found), list(moved_parameters(found))
+    first, run_by_run, missing_term = _figures(found, table, changes)
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
         f"Is the {words.displayed_robot_name(Path(robot_name).name)} model complete?",
         found.statement,
         (
             *remarks(shifts, "moved"),
-            *_first_figure(found, table, changes),
+            first,
             _errors(found),
-            *([Note(rise, name="worse", terminal=True)] if rise else []),
+            *[Note(rise, name="worse", terminal=True)] * bool(rise),
             _advice(found),
-            *remarks(added, "found"),
+            *remarks(_effect_findings(found, changes), "found"),
             *run_tables.curve_warning(found.robot),
         ),
-        tuple(_sections(found, table, changes, missing)),
+        tuple(_sections(found, table, run_by_run, missing_term)),
         brief=loop_words.brief_answer(found, shifts, _next_step(found, "")),
     )
 
 
-def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
-    """Figure of the law that was found, on its readings. For logs or without a law: measured and simulated values."""
-    if isinstance(found.detail, TimeStatistics):
-        lines = _simulated_lines(found)
-        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
-    elif changes:
-        name, change = next(iter(changes.items()))
+def _figures(
+    found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]
+) -> tuple[Figure, list[Block], list[Block]]:
+    """First figure of the page, blocks that show every run, and blocks that show the missing term.
+
+    The first figure is the law that was found, on its readings. For logs or without a law: measured and simulated.
+    """
+    verdict, detail = "none" if found.refit_alone else found.verdict, found.detail
+    curve = [] if found.unnamed is None else [_curve(found)]
+    if isinstance(detail, TimeStatistics):
+        lines = {"after_": "simulated"}
+        if not found.refit_alone:
+            lines = {"after_": "with the effects found", "before_": "before"}
+        runs = dataclasses.replace(found.runs, columns={**found.runs.columns, **table})
+        memory = detail.before.memory
+        numbers = memory.deviate, detail.after.memory.deviate, memory.threshold, (2 * detail.runs) ** 0.5
+        names = ", ".join(detail.orders_unresolved)
+        more = catalogue.text("loop.unresolved", names) if names else ""
+        return (
+            catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement),
+            [
+                fit_tables.fits_of_runs(table, found.channels, lines),
+                *fit_tables.frequency_response(runs, found.channels, lines),
+            ],
+            [
+                catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more),
+                *curve,
+            ],
+        )
+    laws: list[Figure] = []
+    for name, change in changes.items():
         effect = next(e for e in found.effects if e.name == name)
         law = ", or ".join(effect.families), name, loop_words.effect_amplitude(effect)
-        yield catalogue.figure("loop.law", found, table, {name: change}, words=law)
-    elif found.unnamed is not None:
-        yield _curve(found)
-    else:
-        yield catalogue.figure("loop.before_after", table, found.channels, "none", words=("",))
+        laws.append(catalogue.figure("loop.law", found, table, name, change, words=law, suffix=name if laws else ""))
+    residuals = catalogue.figure("loop.before_after", table, found.channels, verdict)
+    first, *others = [*laws, *curve, residuals]
+    missing_term: list[Block] = [*laws[1:]]
+    if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
+        missing_term.append(catalogue.figure("run.measured_drive_plane", found.robot, found.runs))
+    sized = Layout.of(found.robot).crosses_zero
+    closed = _closed(found, table) if sized else catalogue.text("loop.three")
+    missing_term.append(catalogue.figure("loop.defects", table, verdict, sized, words=(closed,)))
+    missing_term += curve if laws else []
+    return first, [*others[-1:]], missing_term
 
 
-def _simulated_lines(found: DiscoveryResult) -> dict[str, str]:
-    """Prefixes of the simulated readings in figures over time, with their names. The proposal is first."""
-    return {"after_": "simulated"} if found.refit_alone else {"after_": "with the effects found", "before_": "before"}
+def _curve(found: DiscoveryResult) -> Figure:
+    """Figure of the smooth curve for an unnamed discrepancy."""
+    assert found.unnamed is not None
+    key = "tentative" if found.effects else "written" if found.written else "left"
+    key = "log" if isinstance(found.detail, TimeStatistics) else key
+    more = catalogue.text(f"loop.curve-{key}", found.unnamed.effect)
+    return catalogue.figure("loop.curve", found.unnamed, words=(more,))
 
 
 def rows_for_figures(found: DiscoveryResult) -> Columns:
@@ -89,12 +121,8 @@ def rows_for_figures(found: DiscoveryResult) -> Columns:
     return table
 
 
-def _rows_are(found: DiscoveryResult) -> str:
-    return "samples" if isinstance(found.detail, TimeStatistics) else "runs"
-
-
 def _effect_findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable[str]:
-    """Section on the effects of the model: meaning, size, certainty and alternatives."""
+    """Sentences on the effects found: meaning, size, certainty and alternatives."""
     for e in found.effects:
         size, other = loop_words.effect_amplitude(e), loop_words.indistinguishable_effects(found, e)
         if e.name in changes:
@@ -123,39 +151,37 @@ def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
             yield loop_words.moved_parameter(name, value, base_shift.prior, base_shift.unit, shift)
 
 
-def _arrow_cell(text: str, change: float) -> Cell:
-    """Cell with errors, and an arrow if they change."""
-    if not abs(change) >= NOTABLE:
-        return Cell(text)
-    return Cell(f"{text} ↓", "good") if change < 0 else Cell(f"{text} ↑", "bad")
-
-
 def _errors(found: DiscoveryResult) -> Table:
     """Errors as given, of the refit and with the effects found, on fitted and on held-out rows."""
-    total, many = len(found.runs), not found.refit_alone
 
     def reached(errors: Mapping[str, Mapping[str, Any]]) -> str:
-        return f"{max((int(e['rows']) for e in errors.values()), default=0)} of {total}"
+        return f"{max((int(e['rows']) for e in errors.values()), default=0)} of {len(found.runs)}"
 
     given = found.errors_as_stated
     rows: list[tuple[Any, ...]] = [
         ("robot file as given", *map(loop_words.percent_text, given.values()), reached(given))
     ]
-    for kind, error_pair in {"": found.errors, **found.errors_held_out}.items():
+    for kind, pair in {"": found.errors, **found.errors_held_out}.items():
         worse = {w.channel for w in found.held_out_worse if w.kind == kind}
+        refit, proposal = pair[0], pair[0 if found.refit_alone else 1]
         cells = []
-        for c in error_pair[0]:
-            texts = [loop_words.percent_text(e[c]) for e in error_pair[: 1 + many]]
-            change = error_pair[1][c]["rms_percent"] - error_pair[0][c]["rms_percent"] if many else 0.0
-            change_shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
-            cells.append(_arrow_cell(" → ".join(texts), change_shown))
-        row_label = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
-        rows.append((row_label, *cells, reached(error_pair[0])))
-    for kind in found.held_out_unpredictable:
-        if kind not in found.errors_held_out:
-            row_label = f"unseen: another {blocks.kind_in_words(kind)}"
-            rows.append((row_label, *["-"] * len(found.channels), "not predictable from the others"))
+        for c in refit:
+            text = " → ".join(loop_words.percent_text(e[c]) for e in pair[: 1 if found.refit_alone else 2])
+            change = proposal[c]["rms_percent"] - refit[c]["rms_percent"]
+            rises = c in worse or (change >= NOTABLE and not kind)
+            falls = change <= -NOTABLE and not rises
+            cells.append(Cell(text + " ↑" * rises + " ↓" * falls, "bad" * rises + "good" * falls))
+        rows.append((_unseen(kind) if kind else "seen by the fit", *cells, reached(refit)))
+    rows += [
+        (_unseen(kind), *["-"] * len(found.channels), "not predictable from the others")
+        for kind in found.held_out_unpredictable
+        if kind not in found.errors_held_out
+    ]
     return catalogue.table("loop.errors", rows, *(f"{c.label} |" for c in found.channels))
+
+
+def _unseen(kind: str) -> str:
+    return f"unseen: another {blocks.kind_in_words(kind)}"
 
 
 def _next_step(found: DiscoveryResult, more: str) -> str:
@@ -178,12 +204,9 @@ def _advice(found: DiscoveryResult) -> Table:
         more = f" It distinguishes {', '.join(after.separates)}. Expected separation: {after.expected_sigma:.1f} σ."
     if after is not None and found.headline.level == "class" and not after.settles:
         more += " Some pairs remain undecided."
-    far = [
-        describe(note)
-        for note in remarks_with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
-    ]
-    against = [note for note in found.remarks if isinstance(note, str)]
-    to_check = [loop_words.largest_share(found), *far, *against[:1]]
+    unusual = remarks_with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
+    against = [note for note in found.remarks if isinstance(note, str)][:1]
+    to_check = [loop_words.largest_share(found), *map(describe, unusual), *against]
     rows = [
         ("May I use it for …", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
         ("What to check first", as_paragraph(to_check) or "Nothing unusual."),
@@ -192,55 +215,55 @@ def _advice(found: DiscoveryResult) -> Table:
     return catalogue.table("loop.advice", rows)
 
 
-def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
+def _certainty_sections(found: DiscoveryResult) -> Iterable[Section]:
     """Sections on the certainty of the answer and its limits."""
-    standing = loop_words.support_sentence(found)
-    also = [] if found.unnamed is None else [loop_words.proposed_formula(found.unnamed)]
-    noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
+    noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
-    (before, after), unusable_count = found.chi2_of_readings, len(found.unusable)
-    chi = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
+    chi = " → ".join(f"{x:.0f}" for x in found.chi2_of_readings[: 1 + _is_missing(found)])
     verb = "are consistent with" if found.after.adequate else "exceed"
-    aside = f" ({unusable_count} without a result of the fitted model, {len(found.outliers)} set aside as outliers)"
-    blocks = [
-        Note(f"{_noise_alone(found)}{found.verdict_statement}", name="statement", terminal=True),
-        *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
-        *([Note(standing, name="standing", terminal=True)] if standing else []),
-        *remarks(also, "also"),
-        Note(
-            f"The residuals {verb} the noise (χ² of {found.readings} readings {chi} σ², {found.replicates} bootstrap "
-            f"tables). {int(found.included.sum())} of {len(found.runs)} {_rows_are(found)} are used"
-            f"{aside * bool(unusable_count or len(found.outliers))}.",
-            name="adequacy",
-            terminal=True,
-        ),
-    ]
-    yield Section("How certain the verdict is", tuple(blocks))
+    used, left_out = int(found.included.sum()), (len(found.unusable), len(found.outliers))
+    rows = "samples" if isinstance(found.detail, TimeStatistics) else "runs"
+    aside = " ({} without a result of the fitted model, {} set aside as outliers)".format(*left_out)
+    adequacy = (
+        f"The residuals {verb} the noise (χ² of {found.readings} readings {chi} σ², {found.replicates} bootstrap "
+        f"tables). {used} of {len(found.runs)} {rows} are used"
+        f"{aside * any(left_out)}."
+    )
+    verdict, support = f"{_noise_alone(found)}{found.verdict_statement}", loop_words.support_sentence(found)
+    cluster = loop_words.cluster_sentence(found.cluster) if found.cluster else ""
+    sentences = (
+        Note(verdict, name="statement", terminal=True),
+        Note(cluster, name="cluster"),
+        Note(support, name="standing", terminal=True),
+        *remarks([] if found.unnamed is None else [loop_words.proposed_formula(found.unnamed)], "also"),
+        Note(adequacy, name="adequacy", terminal=True),
+    )
+    yield Section("How certain the verdict is", tuple(note for note in sentences if note.text))
     yield Section("Before you use it", remarks(filter(None, notes)))
 
 
+def _is_missing(found: DiscoveryResult) -> bool:
+    return found.verdict not in ("none", "undescribed")
+
+
 def _sections(
-    found: DiscoveryResult, table: Columns, changes: Mapping[str, Change], missing: bool
+    found: DiscoveryResult, table: Columns, run_by_run: Sequence[Block], missing_term: Sequence[Block]
 ) -> Iterable[Section]:
+    missing, sized = _is_missing(found), Layout.of(found.robot).crosses_zero
     looked_for = Section("Effects that were tested", tuple(_looked_for(found)))
-    yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table, changes)))
-    yield from [] if missing else [looked_for]
-    heading = "Where the missing term acts" if missing else "What each equation lacks"
-    yield Section(heading, tuple(_blocks_of_missing_terms(found, table, changes)))
+    if run_by_run:
+        yield Section("Measured and simulated, run by run", tuple(run_by_run))
+    yield from [looked_for] * (not missing)
+    yield Section("Where the missing term acts" if missing else "What each equation lacks", tuple(missing_term))
     yield from fit_tables.clusters_section(found.residual_clusters)
-    fits = {
-        when: rms_by_channel
-        for when, rms_by_channel in found.rms.items()
-        if not (found.refit_alone and "after" in when)
-    }
-    sized = Layout.of(found.robot).crosses_zero
-    in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
+    fits = {when: rms for when, rms in found.rms.items() if not (found.refit_alone and "after" in when)}
+    in_units = [fit_tables.rms_table(fits, found.channels)] * sized
     yield Section("Errors", (catalogue.note("loop.fitted_again"), *in_units))
-    yield from _certainty_sections(found, missing)
+    yield from _certainty_sections(found)
     candidates = tuple(_candidates(found))
-    yield from [Section("Candidates", candidates)] if candidates else []
-    yield from [looked_for] if missing else []
+    yield from [Section("Candidates", candidates)] * bool(candidates)
+    yield from [looked_for] * missing
     rows = [
         (
             f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
@@ -259,50 +282,6 @@ def _sections(
     yield Section("Words", (catalogue.table("loop.words", list(words.GLOSSARY.items())),))
 
 
-def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
-    verdict, detail = "none" if found.refit_alone else found.verdict, found.detail
-    if isinstance(detail, TimeStatistics):
-        lines = _simulated_lines(found)
-        yield fit_tables.fits_of_runs(table, found.channels, lines)
-        runs = dataclasses.replace(found.runs, columns={**found.runs.columns, **table})
-        yield from fit_tables.frequency_response(runs, found.channels, lines)
-    elif changes or found.unnamed is not None:  # otherwise it is the first figure
-        yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
-
-
-def _blocks_of_missing_terms(
-    found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]
-) -> Iterable[Block]:
-    verdict, sized = "none" if found.refit_alone else found.verdict, Layout.of(found.robot).crosses_zero
-    if len(changes) > 1:
-        yield catalogue.figure("loop.laws", found, table, changes)
-    if isinstance(detail := found.detail, TimeStatistics):
-        memory = detail.before.memory
-        numbers = memory.deviate, detail.after.memory.deviate, memory.threshold, (2 * detail.runs) ** 0.5
-        names = ", ".join(detail.orders_unresolved)
-        more = catalogue.text("loop.unresolved", names) if names else ""
-        yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
-    else:
-        if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
-            yield catalogue.figure("run.measured_drive_plane", found.robot, found.runs)
-        closed = _closed(found, table) if sized else catalogue.text("loop.three")
-        yield catalogue.figure("loop.defects", table, verdict, sized, words=(closed,))
-    if found.unnamed is not None and (changes or isinstance(detail, TimeStatistics)):  # otherwise the first figure
-        yield _curve(found)
-
-
-def _curve(found: DiscoveryResult) -> Figure:
-    """Figure of the smooth curve for an unnamed discrepancy."""
-    assert found.unnamed is not None
-    if isinstance(found.detail, TimeStatistics):
-        key = "log"
-    else:
-        key = "tentative" if found.effects else "written" if found.written else "left"
-    return catalogue.figure(
-        "loop.curve", found.unnamed, words=(catalogue.text(f"loop.curve-{key}", found.unnamed.effect),)
-    )
-
-
 def _closed(found: DiscoveryResult, table: Columns) -> str:
     """Note on the equations whose errors the channels determine."""
     from sweeps.pages import loop_figures
@@ -316,27 +295,24 @@ def _closed(found: DiscoveryResult, table: Columns) -> str:
 
 
 def _candidates(found: DiscoveryResult) -> Iterable[Block]:
-    """Section with alternatives that explain the data."""
-    several = [(_named(a.effects), a.rise_chi2) for a in found.alternatives]
-    curves = "; none of them is adequate, or curves explain the data better"
-    sizes = [(_named(a.effects), _named(a.sizes), a.rise_chi2, a.why) for a in found.implausible]
-    hidden = [
-        (
-            h.name, f"{h.amplitude:.3g} {h.unit}".removesuffix(" -"), h.sigmas,
-            f"{h.experiment} (expected {h.separation:.1f} σ)" if h.experiment else "",
-        )
-        for h in found.hidden
-    ]  # fmt: skip
-    tables: dict[str, tuple[Sequence[Any], Names]] = {
-        "alternatives": (several, (curves if found.verdict in WITHOUT_NAME else "",)),
-        "hidden": (hidden, ()),
-        "implausible": (sizes, ()),
-    }
-    if any(rows for rows, _ in tables.values()):
+    """Alternatives that explain the data, if there are any."""
+    curves = "; none of them is adequate, or curves explain the data better" * (found.verdict in WITHOUT_NAME)
+    tables: dict[str, list[tuple[Any, ...]]] = {
+        "alternatives": [(_named(a.effects), a.rise_chi2) for a in found.alternatives],
+        "hidden": [
+            (
+                h.name, f"{h.amplitude:.3g} {h.unit}".removesuffix(" -"), h.sigmas,
+                f"{h.experiment} (expected {h.separation:.1f} σ)" if h.experiment else "",
+            )
+            for h in found.hidden
+        ],
+        "implausible": [(_named(a.effects), _named(a.sizes), a.rise_chi2, a.why) for a in found.implausible],
+    }  # fmt: skip
+    if any(tables.values()):
         yield catalogue.note("loop.definitions")
-    for name, (rows, values) in tables.items():
+    for name, rows in tables.items():
         if rows:
-            yield catalogue.note(f"loop.{name}-above", *values)
+            yield catalogue.note(f"loop.{name}-above", curves)
             yield catalogue.table(f"loop.{name}", rows)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -57,14 +57,10 @@ class Missions:
 
     def _run_as_json(self, row: int) -> Json:
         to = {name: f"energy_to_{name}_Wh" for name in SINKS}
-        numbers = {
-            c: float(self.table[c][row])
-            for c in mission_batch.mission_columns(self.source.turns)
-            if c not in to.values()
-        }
+        columns = [c for c in mission_batch.mission_columns(self.source.turns) if c not in to.values()]
         flags = str(self.table["flags"][row])
         return {
-            **numbers,
+            **{c: float(self.table[c][row]) for c in columns},
             "energy_by_where_Wh": {name: float(self.table[column][row]) for name, column in to.items()},
             "status": str(self.table["status"][row]),
             "flags_raised": flags.split(";") if flags else [],
@@ -79,9 +75,11 @@ _RUNS = (
     "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
     *(output.column for output in TABLE["mission of sides"]), "status", "flags",
 )  # fmt: skip
-#: Quantities of each segment.
-_OF_SEGMENTS = ("energy_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C")
-_NO_RETURN = "No energy returned to the source"
+#: Quantities of each segment, each with its total over several cycles.
+_OF_SEGMENTS = {
+    "energy_Wh": np.sum, "distance_m": np.sum, "rms_current_A": None, "peak_current_A": np.max,
+    "winding_peak_C": np.max,
+}  # fmt: skip
 
 
 def missions_document(file: RobotFile, found: Missions) -> Document:
@@ -89,81 +87,80 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     table, source = found.table, found.source
     shown_columns = capabilities.drop_inapplicable_columns(file.robot, table)
     first_run, names = {key: value[0] for key, value in table.items()}, _names(table)
+    many = len(names) > 1
     answer = mission_answer({key: value[0] for key, value in shown_columns.items()}, file.robot.has_ground)
-    fed = "battery" if np.isfinite(first_run["state_of_charge"]) else "supply"
     cycles, per_cycle = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
-    between = "linear" if source.linear else "held"
     lead = (
         f"Profile **{source.source}**: {source.duration:g} s{cycles}, {count_noun(source.segment_count, 'segment')}"
-        f"{per_cycle}, values {between} between rows. Its {fed} supplies it."
+        f"{per_cycle}, values {'linear' if source.linear else 'held'} between rows. Its "
+        f"{'battery' if _on_battery(first_run) else 'supply'} supplies it."
     )
-    detail = f"In detail the first of {len(names)} runs: **{names[0]}**." if len(names) > 1 else ""
+    detail = f"In detail the first of {len(names)} runs: **{names[0]}**." * many
     runs = run_tables.quantity_table(
         "runs", shown_columns, _RUNS, first=[(Column("run"), names)], file="runs.csv", sideways=True
     )
-    endings = run_tables.endings_table(Counter(map(str, table["status"])))
-    is_complete = len(names) == 1 and first_run["status"] == "converged"
+    endings = [] if not many and first_run["status"] == "converged" else [
+        run_tables.endings_table(Counter(map(str, table["status"])))
+    ]  # fmt: skip
     return Document(
-        f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
+        f"Mission {source.source}" + ("" if many else f" of {names[0]}"),
         answer,
         (
             run_tables.note_on_robot(file, more=detail),
             Note(lead, terminal=True),
             *remarks(_exceeded_limits(found), "flags"),
             runs,
-            *([] if is_complete else [endings]),
+            *endings,
             *remarks(_charge_left(table)),
         ),
         page_sections=lambda: _sections(file.robot, found, first_run),
     )
 
 
+def _on_battery(run: Json) -> bool:
+    return bool(np.isfinite(run["state_of_charge"]))
+
+
 def _sections(robot: Robot, found: Missions, first: Json) -> Iterable[Section]:
     """Sections on the first run: over time, from above, energy and segments."""
-    source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
-    run_rows = found.course["run_id"] == name
-    rows = {
-        key: value[run_rows] for key, value in capabilities.drop_inapplicable_columns(robot, found.course).items()
-    }
+    source, name = found.source, found.segments["run_id"][0]
+    idle, run_rows = capabilities.inapplicable_columns(robot), found.course["run_id"] == name
+    rows = {key: value[run_rows] for key, value in found.course.items() if key not in idle}
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
     course = catalogue.figure(
-        "mission.course", rows, cycle, limit, source.linear, float(robot.sides), words=(len(rows["time_s"]),),
-        more="" if found.whole else catalogue.text("mission.cut"),
+        "mission.course", rows, cycle, float(robot.motor.temperature_limit), source.linear, float(robot.sides),
+        words=(len(rows["time_s"]),), more="" if found.whole else catalogue.text("mission.cut"),
     )  # fmt: skip
     limits = run_tables.limits_table(mission_limits(robot, first), "this mission")
     yield Section("Over time", (course, limits, catalogue.note("run.warming")), "course-section")
     if source.turns:
         x_y_yaw = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
-        sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
-                 for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
-        heat = catalogue.text("mission.heat", *sides[1]) if robot.knows(WARMING) else ""
-        yield Section(
-            "From above",
-            (
-                catalogue.figure("mission.path", robot, first, *x_y_yaw, words=(first["turned_deg"],)),
-                catalogue.figure("mission.sides", rows, words=sides[0], more=heat),
-            ),
-            "path-section",
-        )
-    returned_Wh, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
-    returned = f"{returned_Wh:.3g} Wh returned to the source." if returned_Wh > 1e-6 * first["energy_drawn_Wh"] else (
-        f"{_NO_RETURN}. Driven motors first supply other consumers." if on_battery else f"{_NO_RETURN}."
-    )  # fmt: skip
-    source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
-    labels = words.sink_labels(robot.has_ground)
-    uses = [(label, float(first[f"energy_to_{name}_Wh"])) for name, label in labels.items()]
-    uses += [
-        ("kinetic energy at the end", float(first["energy_stored_Wh"])), ("returned to the source", returned_Wh)
-    ]  # fmt: skip
-    drawn = max(float(first["energy_drawn_Wh"]), 1e-12)
-    shares = [(label, energy, 100 * energy / drawn) for label, energy in uses if abs(energy) > 1e-5 * drawn]
-    energy = catalogue.table("mission.energy", shares), catalogue.note("mission.energy", *source_name)
-    yield Section("Where the energy goes", energy, "energy-section")
-    yield Section(
-        "Segments",
-        (_segments(found, name, capabilities.inapplicable_columns(robot)), catalogue.note("mission.settles")),
-        "segments-section",
-    )  # fmt: skip
+        currents, heats = ([first[form.format(side)] for side in channels.SIDES]
+                           for form in ("rms_current_{}_A", "winding_peak_{}_C"))  # fmt: skip
+        heat = catalogue.text("mission.heat", *heats) if robot.knows(WARMING) else ""
+        path = catalogue.figure("mission.path", robot, first, *x_y_yaw, words=(first["turned_deg"],))
+        sides = catalogue.figure("mission.sides", rows, words=currents, more=heat)
+        yield Section("From above", (path, sides), "path-section")
+    yield Section("Where the energy goes", _energy(robot, first), "energy-section")
+    segments = _segments(found, name, idle), catalogue.note("mission.settles")
+    yield Section("Segments", segments, "segments-section")
+
+
+def _energy(robot: Robot, run: Json) -> tuple[Table, Note]:
+    """Uses of the energy that a mission draws."""
+    drawn, returned_Wh = float(run["energy_drawn_Wh"]), float(run["energy_returned_Wh"])
+    returned = "No energy returned to the source."
+    if returned_Wh > 1e-6 * drawn:
+        returned = f"{returned_Wh:.3g} Wh returned to the source."
+    elif _on_battery(run):
+        returned += " Driven motors first supply other consumers."
+    uses = {label: run[f"energy_to_{name}_Wh"] for name, label in words.sink_labels(robot.has_ground).items()}
+    uses |= {"kinetic energy at the end": run["energy_stored_Wh"], "returned to the source": returned_Wh}
+    drawn = max(drawn, 1e-12)
+    shares = [(label, x, 100 * x / drawn) for label, x in uses.items() if abs(x) > 1e-5 * drawn]
+    source = "battery's charge" if _on_battery(run) else "supply"
+    note = catalogue.note("mission.energy", source, returned, abs(run["unaccounted_share"]))
+    return catalogue.table("mission.energy", shares), note
 
 
 def _names(runs: Columns) -> list[str]:
@@ -191,9 +188,9 @@ def mission_answer(run: Json, on_ground: bool = True) -> str:
 
 
 def mission_limits(robot: Robot, run: Json) -> list[Json]:
-    """Table of the use of each limit by a mission."""
-    motor, gearbox, heat = robot.motor, robot.gearbox, robot.knows(WARMING)
-    speed, unknown = run["peak_motor_speed_rpm"], 0.0 if heat else np.nan
+    """Use of each limit by a mission."""
+    motor, gearbox, speed = robot.motor, robot.gearbox, run["peak_motor_speed_rpm"]
+    unknown = 0.0 if robot.knows(WARMING) else np.nan
     limits = [
         ("hottest winding", run["winding_peak_C"] + unknown, motor.temperature_limit, "{:.0f} °C"),
         ("motor speed", speed, float(motor.speed_limit) / RPM, "{:.0f} rpm"),
@@ -224,75 +221,61 @@ def _exceeded_limits(found: Missions) -> Iterable[str]:
 
 def _charge_left(table: Columns) -> Iterable[str]:
     """Sentence on the charge at cut-off, if a mission was cut off."""
-    charge_left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
-    if len(charge_left):
-        span = (
-            f"{charge_left.min():.1f}"
-            if len(charge_left) == 1
-            else f"{charge_left.min():.1f} to {charge_left.max():.1f}"
-        )
+    left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
+    if len(left):
+        span = " to ".join(f"{x:.1f}" for x in (left.min(), left.max())[: len(left)])
         yield f"cut off: ended with {span} % of the charge left"
 
 
 def _segments(found: Missions, name: str, idle: set[str]) -> Table:
     """Table of the segments of a run: the first cycle, and totals over all cycles."""
     source, many = found.source, found.source.cycles > 1
+    run_rows = found.segments["run_id"] == name
     shown_columns = [c for c in _OF_SEGMENTS if c not in idle]
-    totals = [c for c in shown_columns if c != "rms_current_A"] if many else []
-    rows = {key: value[found.segments["run_id"] == name] for key, value in found.segments.items()}
-    total_energy, answer = float(np.sum(rows["energy_Wh"])), []
+    totals = {c: total for c in shown_columns if (total := _OF_SEGMENTS[c]) is not None and many}
+    total_energy, answer = float(np.sum(found.segments["energy_Wh"][run_rows])), []
     for k in range(min(source.segment_count, SEGMENTS)):
-        segment_rows = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
-        if not len(segment_rows["status"]):
+        picked = run_rows & (found.segments["segment"] == k + 1)
+        if not picked.any():
             continue
-        ends = Counter(map(words.short_status, map(str, segment_rows["status"])))
-        flags = dict.fromkeys(flag for f in segment_rows["flags"] for flag in str(f).split(";") if flag)
-        begin, end = (float(source.time[j] - source.time[0]) for j in (k, k + 1))
-        sums = [
-            np.sum(segment_rows[c]) if c in ("energy_Wh", "distance_m") else np.max(segment_rows[c]) for c in totals
-        ]
-        shares = (
-            [100 * float(np.sum(segment_rows["energy_Wh"])) / total_energy if total_energy > 0 else None]
-            if many
-            else []
-        )
+        rows = {key: value[picked] for key, value in found.segments.items()}
+        ends = Counter(map(words.short_status, map(str, rows["status"])))
+        flags = dict.fromkeys(flag for f in rows["flags"] for flag in str(f).split(";") if flag)
+        begin, end = source.time[k : k + 2] - source.time[0]
+        share = 100 * float(np.sum(rows["energy_Wh"])) / total_energy if total_energy > 0 else None
         answer.append(
             (
-                f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand_in_words(found, k),
-                *(segment_rows[c][0] for c in shown_columns), *sums, *shares,
+                f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand_in_words(source, k),
+                *(rows[c][0] for c in shown_columns), *(total(rows[c]) for c, total in totals.items()),
+                *[share] * many,
                 ", ".join(f"{s} ({n})" if many else s for s, n in ends.items()),
                 ", ".join(words.FLAGS[f] for f in flags) or "none",
             )
         )  # fmt: skip
-    group = "first cycle" if many else "this segment"
-    headings = [quantity_column(c, group=group) for c in shown_columns] + [
-        quantity_column(c, group="all cycles") for c in totals
-    ]
-    headings += columns(*["all cycles > share of energy [%] | .1f"] * many)
+    headings = [quantity_column(c, "first cycle" if many else "this segment") for c in shown_columns]
+    headings += [quantity_column(c, "all cycles") for c in totals]
+    headings += columns("all cycles > share of energy [%] | .1f") * many
     return catalogue.table("mission.segments", answer, *headings)
 
 
-def _demand_in_words(found: Missions, k: int) -> str:
+def _demand_in_words(source: ProfileTable, k: int) -> str:
     """Demand of the profile in a segment, in words."""
-    source = found.source
-    last_row = k + 1 if source.linear else k
 
-    def span(values: np.ndarray, factor: float, unit: str) -> str:
-        begin, end = float(values[k]) / factor, float(values[last_row]) / factor
+    def span(values: np.ndarray, unit: str, factor: float = 1.0) -> str:
+        begin, end = values[k] / factor, values[k + 1 if source.linear else k] / factor
         unit = unit if unit == "°" else f"\u00a0{unit}"
         return f"{begin:g}{unit}" if abs(begin - end) < 1e-9 else f"{begin:g} to {end:g}{unit}"
 
-    mode = source.modes[k]
-    phrases = []
+    def spans(units: Mapping[str, str], factor: float = 1.0) -> list[str]:
+        return [span(source.values[name], unit, factor) for name, unit in units.items() if name in source.values]
+
+    mode, phrases = source.modes[k], list[str]()
     if mode in CONTROLLED:
         channel = channels.find_channel(mode)
-        phrases.append(span(source.demand, channel.factor, channel.unit))
-        if mode == "speed" and YAW_RATE in source.values:
-            phrases.append(span(source.values[YAW_RATE], 1.0, channels.find_channel(YAW_RATE).unit))
+        phrases.append(span(source.demand, channel.unit, channel.factor))
+        phrases += spans({YAW_RATE: channels.find_channel(YAW_RATE).unit}) if mode == "speed" else []
     elif mode == "voltage":
-        shares = [(name, 0.01, "% duty") for name in ("duty", *PAIRS[0])] + [(name, 1.0, "V") for name in PAIRS[1]]
-        spans = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]
-        phrases.append(" and ".join(spans) or "100 % duty")
-    units = {"voltage": "V", "slope_deg": "°", "payload": "kg", "load_torque": "N·m", "current_other": "A"}
-    phrases += [span(source.values[name], 1.0, unit) for name, unit in units.items() if name in source.values]
+        duties = spans(dict.fromkeys(("duty", *PAIRS[0]), "% duty"), 0.01)
+        phrases.append(" and ".join([*duties, *spans(dict.fromkeys(PAIRS[1], "V"))]) or "100 % duty")
+    phrases += spans({"voltage": "V", "slope_deg": "°", "payload": "kg", "load_torque": "N·m", "current_other": "A"})
     return ", ".join([*phrases, *([source.surface[k]] if source.surface else [])])

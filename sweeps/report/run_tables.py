@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -15,22 +16,22 @@ from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
-from mmrjax.model.quantities import SET, TABLE, Condition
+from mmrjax.model.quantities import RPM, SET, TABLE, Condition
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.capabilities import UNLIMITED
 from sweeps.pages import words
 from sweeps.points import run
 from sweeps.report import catalogue
-from sweeps.report.document import Cell, Column, Note, Table, columns
+from sweeps.report.document import Cell, Column, Note, Table, columns, table_from_cells
 
-#: Units of quantities that may be imposed on a run, by column.
-UNITS = {column: column.rpartition("_")[2] for column, _ in IMPOSED.values()}
+#: Columns of quantities that may be imposed on a run.
+_IMPOSED = {column for column, _ in IMPOSED.values()}
 
 
 def imposed_column(runs: Iterable[str]) -> str:
     """Column of the imposed quantity of runs: conditions precede readings."""
-    return next(column for column in runs if column in UNITS)
+    return next(column for column in runs if column in _IMPOSED)
 
 
 def _column(condition: Condition) -> str:
@@ -38,19 +39,22 @@ def _column(condition: Condition) -> str:
     return next((c.column for c in channels.EVERY if c.name == condition.name), condition.column)
 
 
-#: Heading of each condition and format of its numbers, by column.
-CONDITIONS = {_column(c): (c.heading, c.shown) for c in SET if c.heading}
+#: Each condition in a table of runs, by column.
+_CONDITIONS = {_column(c): columns(f"{c.heading} | {c.shown}")[0] for c in SET if c.heading}
 
 
-def condition_formats(table: Columns, *, mass: bool = False) -> dict[str, tuple[str, str]]:
-    """Heading and format of each condition of a table, by column, without columns that are readings.
+def condition_columns(table: Columns, *, mass: bool = False) -> dict[str, Column]:
+    """Columns of the conditions of a table, by name, without those that are readings.
 
     Args:
         mass: True to include the total mass.
     """
-    readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
-    formats = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
-    return {c: about for c, about in formats.items() if mass or c != "total_mass_kg"}
+    return {
+        name: column
+        for name, column in _CONDITIONS.items()
+        if name in table and not {f"simulated_{name}", f"after_{name}"} & table.keys()
+        and (mass or name != "total_mass_kg")
+    }  # fmt: skip
 
 
 #: Quantities by column. If several have the same column, that of runs.
@@ -59,30 +63,30 @@ _REGISTERED = {
     for place in ("derived", "mission of sides", "mission", "run", "channel of a turn", "channel")
     for q in TABLE[place]
 }
-#: Columns of runs without a row in a registry: heading, unit, format.
+#: Columns of runs without a row in a registry.
 _OTHERS = {
-    "configuration": ("configuration", "", ""),
-    "status": ("status", "", ""),
-    "flags": ("limits exceeded", "", ""),
-    "time_end_s": ("time at the end", "s", "{:.6g}"),
-    "permissible_time_s": ("permissible time at this current", "s", "{:.3g}"),
+    "configuration": Column("configuration"),
+    "status": Column("status"),
+    "flags": Column("limits exceeded"),
+    "time_end_s": Column("time at the end", "s", "{:.6g}"),
+    "permissible_time_s": Column("permissible time at this current", "s", "{:.3g}"),
 }
 #: Text for infinite or missing numbers in some columns.
 _ENDLESS = {"permissible_time_s": words.FOR_EVER}
 _MISSING = {"supply_voltage_V": "battery", "flags": "none"}
 
 
-def quantity_column(name: str, **options: Any) -> Column:
+def quantity_column(name: str, group: str = "") -> Column:
     """Column of a quantity in a report, from the name of its column in a table of runs."""
     if name in _REGISTERED:
         q = _REGISTERED[name]
-        return Column(q.label, q.unit_shown.replace("-", ""), f"{{:.{q.resolution}f}}", **options)
-    if name in CONDITIONS:
-        title, form = CONDITIONS[name]
-        heading, _, unit = title.removesuffix("]").partition(" [")
-        return Column(heading, unit, form, **options)
-    heading, unit, form = _OTHERS[name]
-    return Column(heading, unit, form, **options)
+        return Column(q.label, q.unit_shown.replace("-", ""), f"{{:.{q.resolution}f}}", group)
+    return dataclasses.replace(_CONDITIONS.get(name) or _OTHERS[name], group=group)
+
+
+def axis_title(column: str) -> str:
+    """Label of an axis over a condition or reading, with its unit."""
+    return "supply voltage [V]" if column == "supply_voltage_V" else quantity_column(column).title
 
 
 def quantity_cells(table: Columns, name: str) -> list[Any]:
@@ -99,37 +103,30 @@ def quantity_cells(table: Columns, name: str) -> list[Any]:
     return [missing if math.isnan(v) else endless if math.isinf(v) else v for v in values]
 
 
-def quantity_table(name: str, table: Columns, names: Iterable[str], **options: Any) -> Table:
+def quantity_table(
+    name: str, table: Columns, names: Iterable[str], first: Sequence[tuple[Column, Sequence[Any]]] = (), **fields: Any
+) -> Table:
     """Table with one row for each run, of those quantities `names` that the table of runs has.
 
     Args:
         name: name of the table.
-        options: further fields of the table, and its `first` columns with their cells.
+        first: first columns with their cells.
+        fields: further fields of the table.
     """
-    first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
     empty = {n for n, x in table.items() if x.dtype.kind == "f" and np.isnan(x).all()} - {"supply_voltage_V"}
     shown_names = [n for n in dict.fromkeys(names) if n in table and n not in empty]
-    heads = (*(column for column, _ in first), *map(quantity_column, shown_names))
-    cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown_names)]
-    return Table(name, heads, list(zip(*cells, strict=True)), **options)
+    cells = [(quantity_column(n), quantity_cells(table, n)) for n in shown_names]
+    return table_from_cells(name, [*first, *cells], **fields)
+
+
+def reading_form(channel: Channel) -> str:
+    """Format of readings, with one digit less than their channel's resolution."""
+    return f"{{:.{max(channel.resolution - 1, 0)}f}}"
 
 
 def reading_text(value: Any, channel: Channel) -> str:
-    """Reading with one digit less than its channel's resolution. A dash if it is missing."""
-    return Column("", form=f"{{:.{max(channel.resolution - 1, 0)}f}}").text(value)
-
-
-def reading_columns(shown: Iterable[Channel], kinds: Mapping[str, str]) -> list[tuple[str, Column]]:
-    """Columns of readings, grouped by channel, with their names in a table.
-
-    Args:
-        kinds: heading of each kind of reading, by the prefix of its column, such as `{"": "measured"}`.
-    """
-    return [
-        (f"{prefix}{c.column}", Column(heading, c.unit, f"{{:.{max(c.resolution - 1, 0)}f}}", c.label))
-        for c in shown
-        for prefix, heading in kinds.items()
-    ]
+    """Reading as text. A dash if it is missing."""
+    return Column("", form=reading_form(channel)).text(value)
 
 
 def note_on_robot(file: RobotFile, model: str = "", more: str = "") -> Note:
@@ -163,7 +160,8 @@ def endings_table(
         meanings: meanings of statuses that do not come from a fidelity.
         more: further columns, with values by status.
     """
-    total, reached = sum(counts.values()), [s for s, n in counts.items() if n]
+    order = [*words.STATUSES, *counts]
+    total, reached = sum(counts.values()), sorted((s for s, n in counts.items() if n), key=order.index)
     further = (f"~{name.replace('_', ' ')}" for name in more)
     heads = columns("ended", f"{things} | ,", "share [%] | .3g", "~status", "meaning", *further)
     meant = {s: meanings.get(s) or words.VERDICTS.get((model, s)) or words.status_meaning(s) for s in reached}
@@ -177,9 +175,25 @@ def endings_table(
     return Table("statuses", heads, rows)
 
 
+def operating_points(robot: Robot, runs: Columns) -> Columns:
+    """Torque at the gearbox output, speed and current of one motor in settled runs, from columns of `runs.csv`."""
+    radius = np.array([float(robot.configurations[name].radius) for name in runs["configuration"]])
+    output = runs["theoretical_speed_mm_s"] / 1e3 / radius
+    with np.errstate(divide="ignore", invalid="ignore"):
+        torque = runs["power_gear_W"] / float(robot.sides) / output
+    speed = output * float(robot.gearbox.ratio) / RPM
+    return {"torque_Nm": torque, "motor_rpm": speed, "motor_A": runs["total_current_A"] / float(robot.sides)}
+
+
 def limits_table(limits: Sequence[Json], what: str) -> Table:
     """Table of the use of each limit: value, limit, and share that is used."""
-    rows = [(limit["words"], limit["value"], limit["limit"], _percent_used(limit)) for limit in limits]
+    rows = []
+    for limit in limits:
+        share = limit["percent"]
+        used = f"not checked: the robot's file has no `{limit['unstated']}`" if share is None else Cell(
+            share, "over" if share > 100 else "bar"
+        )  # fmt: skip
+        rows.append((limit["words"], limit["value"], limit["limit"], used))
     return catalogue.table("run.limits", rows, f"{what} |")
 
 
@@ -205,9 +219,3 @@ def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) ->
 def warming_share(value: float, limit: float, ambient: float) -> float:
     """Share of a winding's permissible temperature rise [%]."""
     return 100 * (value - ambient) / max(limit - ambient, 1.0)
-
-
-def _percent_used(limit: Json) -> Cell | str:
-    if limit["percent"] is None:
-        return f"not checked: the robot's file has no `{limit['unstated']}`"
-    return Cell(limit["percent"], "over" if limit["percent"] > 100 else "bar")

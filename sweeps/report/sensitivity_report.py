@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
@@ -12,7 +11,7 @@ from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityR
 from calibration.words import sensitivity_words
 from sweeps.pages.words import short_name
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Block, Document, Note, Section, Table, remarks
+from sweeps.report.document import Document, Section, Table, remarks
 
 #: Most pairs in a table of interactions, and most outputs that are not folded.
 PAIRS, UNFOLDED = 5, 3
@@ -34,15 +33,8 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
         "sensitivity.overview", found, words=(_OF.get(found.method, ""), "; ".join(parts), 100 * NEGLIGIBLE),
         more=catalogue.text("sensitivity.sobol") if found.method == "sobol" else "",
     )  # fmt: skip
-    idle = "less than {:g} % everywhere: {}".format(100 * NEGLIGIBLE, ", ".join(found.negligible))
-    said = [idle] * bool(found.negligible)
-    # the most important inputs for each output
-    rows = []
-    for study in found.outputs.values():
-        share = study.overall_share
-        top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
-        cells = [f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in top]
-        rows.append((study.row.label, *cells, *[""] * (3 - len(cells))))
+    idle = [f"less than {100 * NEGLIGIBLE:g} % everywhere: {', '.join(found.negligible)}"] * bool(found.negligible)
+    rows = [_row(study, found) for study in found.outputs.values()]
     return Document(
         "Which parameters matter",
         found.statement(),
@@ -50,60 +42,47 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
             run_tables.note_on_robot(file, found.model, method + ran),
             catalogue.table("sensitivity.leading", rows),
             overview,
-            *remarks([*said, *found.notes]),
+            *remarks([*idle, *found.notes]),
         ),
         page_sections=lambda: _sections(found),
     )
 
 
+def _row(study: OutputStudy, found: SensitivityResult) -> tuple[str | None, ...]:
+    """The most important inputs for an output, and its range and spread over the operating points."""
+    share, row = study.overall_share, study.row
+    order = [k for k in np.argsort(-share, kind="stable")[:3] if share[k] >= NEGLIGIBLE]
+    leading = [f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in order]
+    value, sd = study.value / row.factor, study.sd / row.factor
+    finite = np.isfinite(value) & np.isfinite(sd)
+    numbers: list[str | None] = [None] * 3
+    if finite.any():
+        low, high, spread = value[finite].min(), value[finite].max(), np.median(sd[finite])
+        numbers = [f"{x:.{row.resolution}f}" for x in (low, high, spread)]
+    return row.label, *leading, *[""] * (3 - len(leading)), *numbers, row.unit_shown.replace("-", "")
+
+
 def _sections(found: SensitivityResult) -> Iterable[Section]:
     yield Section("Output by output", (catalogue.note("sensitivity.legend"),), "outputs")
     for k, (name, study) in enumerate(found.outputs.items()):
-        yield Section(study.row.label.capitalize(), (Note(_sentence(study, found)),), name, level=3)
-        if bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _any_influence(study):
-            folded = "tornado" if k >= UNFOLDED else ""
-            yield Section("", tuple(_output(name, study, found)), folded=folded)
+        label, acts = study.row.label.capitalize(), bool(study.overall_share.max(initial=0.0) > 0)
+        acts = acts and bool(study.studied.any()) and bool(np.isfinite(study.value).any())
+        yield Section(label, () if acts else (catalogue.note("sensitivity.nothing"),), name, level=3)
+        if acts:
+            finding = f"{study.row.label} with one input at the ends of its interval"
+            tornado = catalogue.figure(
+                "sensitivity.tornado", study, found, finding=finding, words=(label,), suffix=name
+            )
+            yield Section("", (tornado,), folded="tornado" if k >= UNFOLDED else "")
     yield Section("Inputs", (_inputs(found), catalogue.note("sensitivity.largest")), "inputs")
-
-
-def _any_influence(study: OutputStudy) -> bool:
-    """True if any input changes an output."""
-    return bool(study.overall_share.max(initial=0.0) > 0)
-
-
-def _output(name: str, study: OutputStudy, found: SensitivityResult) -> Iterable[Block]:
-    """Figure of an output."""
-    label = study.row.label
-    figure = catalogue.figure(
-        "sensitivity.tornado", study, found, finding=_sentence(study, found), words=(label.capitalize(),)
-    )
-    yield dataclasses.replace(figure, name=f"tornado_{name}")
-
-
-def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
-    """Sentence on the most important inputs for an output, with its spread."""
-    share, row = study.overall_share, study.row
-    if not _any_influence(study):
-        return "No value at these operating points, or no input changes it."
-    order = np.argsort(-share, kind="stable")[:3]
-    top = [k for k in order if share[k] >= NEGLIGIBLE] or order[:1]
-    who = ", ".join(f"{sensitivity_words.input_in_words(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
-    value, sd = study.value / row.factor, study.sd / row.factor
-    finite = np.isfinite(value) & np.isfinite(sd)
-    unit = "" if row.unit_shown == "-" else f" {row.unit_shown}"
-    digits = row.resolution
-    low, high = value[finite].min(), value[finite].max()
-    spans = f"from {low:.{digits}f} to {high:.{digits}f}{unit} over the operating points"
-    spread = f"uncertain by ±{np.median(sd[finite]):.{digits}f}{unit} (one sd, median of the points)"
-    return f"{who[0].upper()}{who[1:]}. It ranges {spans}, and is {spread}."
 
 
 def _inputs(found: SensitivityResult) -> Table:
     """Table of all inputs with their distributions, the most important first."""
     importance, rows = found.importance(), []
     for k in np.argsort(-importance, kind="stable"):
-        name, share = found.names[k], importance[k]
-        x = found.inputs[name]
+        name = found.names[k]
+        x, share = found.inputs[name], importance[k]
         largest = f"{100 * share:.0f} %" if share >= NEGLIGIBLE else f"< {100 * NEGLIGIBLE:g} %"
         interval = "{:.3g} to {:.3g}".format(*x.interval)
         rows.append((f"`{name}`", x.meaning, x.unit, x.distribution, x.median, interval, largest))

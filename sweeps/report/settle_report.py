@@ -10,41 +10,32 @@ from calibration.data.settling import Settled, Stretch
 from calibration.words import table_words as words
 from sweeps.report import catalogue
 from sweeps.report.document import Document, Note, Section, Table, columns, remarks
-
-#: Imposed quantity of a log and its unit.
-IMPOSED = {
-    "voltage": ("voltage", "V"),
-    "motor_speed": ("motor speed", "rpm"),
-    "motor_current": ("motor current", "A"),
-    "goal_angle": ("goal", "deg"),
-    "goal_speed": ("goal", "rpm"),
-    "goal_current": ("goal", "A"),
-}
+from sweeps.report.run_tables import axis_title
 
 
 def settle_document(found: Settled, few: str, notes: Names) -> Document:
     """The report. `few`: sentence on too few settled runs. `notes`: further sentences on the settled runs."""
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
-    next_step = Note(few, "lead", "few", terminal=True) if few else next_step
-    all_remarks = (*words.settle_remarks(found), *notes)
+    statement, levels = words.settle_statement(found), Note(words.levels_and_samples(found), "key")
     omitted = words.omitted_stretches(found.stretches, bool(few) and not found.runs.turns)
-    log = catalogue.figure("settle.log", found, finding=words.settle_statement(found))
-    sections = [Section("Over the log", (log,))]
-    if omitted:
-        sections.append(Section("Left out", (catalogue.table("settle.left", omitted),)))
-    levels = Note(words.levels_and_samples(found), "key")
-    settled = Section("Settled runs", (_settled(found), levels, catalogue.note("settle.sds")))
+    left_out = Section("Left out", (catalogue.table("settle.left", omitted),))
     return Document(
         f"Settled runs of {Path(found.runs.source).name}",
-        words.settle_statement(found),
-        (next_step, *remarks(all_remarks)),
-        (*sections, settled),
+        statement,
+        (
+            Note(few, "lead", "few", terminal=True) if few else next_step,
+            *remarks((*words.settle_remarks(found), *notes)),
+        ),
+        (
+            Section("Over the log", (catalogue.figure("settle.log", found, finding=statement),)),
+            *[left_out] * bool(omitted),
+            Section("Settled runs", (_settled(found), levels, catalogue.note("settle.sds"))),
+        ),
     )
 
 
 def _settled(found: Settled) -> Table:
-    imposed, unit = IMPOSED[found.runs.layout.imposed]
-    titles = ["where", "samples used |", "of the level |", f"{imposed} [{unit}] | .4g"]
+    titles = ["where", "samples used |", "of the level |", f"{axis_title(found.runs.layout.imposed_column)} | .4g"]
     for signal in found.signals:
         c = signal.channel
         titles += [f"{c.label} > mean [{c.unit}] | .5g", f"{c.label} > ± [{c.unit}] | .2g"]

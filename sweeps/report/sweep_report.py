@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,36 +25,47 @@ from sweeps.report.document import Block, Column, Document, Figure, Note, Sectio
 from sweeps.report.run_tables import imposed_column, quantity_column
 
 
+class VariedQuantity(NamedTuple):
+    """A quantity that varies: its values at the drawn points, its label with unit, and words for the values if it has
+    any.
+    """
+
+    values: np.ndarray
+    label: str
+    words: tuple[str, ...] = ()
+
+
 def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[str] = ()) -> Document:
     """Report of a finished sweep."""
     shown_runs = capabilities.drop_inapplicable_columns(file.robot, runs)
-    statuses = Counter(map(str, runs["status"]))
-    statuses_known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
-    flagged_by_status = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in statuses_known}
-    ranges_by_status = {
-        s: "" if s in words.SETTLED else _ranges_of_runs(runs, runs["status"] == s) for s in statuses_known
-    }
-    maps = []
-    for c in file.robot.channels:
-        labels = c.label.capitalize(), c.unit
-        figure = catalogue.figure("sweep.sweep", runs, c, finding=f"{c.label} over the grid", words=labels)
-        maps.append(dataclasses.replace(figure, name=f"sweep_{c.name}"))
+    statuses, is_flagged = Counter(map(str, runs["status"])), runs["flags"] != ""
+    flagged_by_status = {s: int(((runs["status"] == s) & is_flagged).sum()) for s in statuses}
+    ranges_by_status = {s: "" if s in words.SETTLED else _ranges_of_runs(runs, runs["status"] == s) for s in statuses}
+    maps = [
+        catalogue.figure(
+            "sweep.sweep",
+            runs,
+            c,
+            finding=f"{c.label} over the grid",
+            words=(c.label.capitalize(), c.unit),
+            suffix=c.name,
+        )
+        for c in file.robot.channels
+    ]
     axes = "; ".join(_levels(runs, c) for c in _axes(runs))
     extremes = (*(c.column for c in file.robot.channels), "slip", "winding_settled_C")
     kinds, flag_index = np.unique(runs["flags"], return_inverse=True)
     rows = []
     for flag, meaning in words.FLAGS.items():
-        is_flagged = np.array([flag in str(f).split(";") for f in kinds])[flag_index]
-        if is_flagged.any():
-            rows.append((f"{meaning} (`{flag}`)", int(is_flagged.sum()), _ranges_of_runs(runs, is_flagged)))
+        is_raised = np.array([flag in str(f).split(";") for f in kinds])[flag_index]
+        if is_raised.any():
+            rows.append((f"{meaning} (`{flag}`)", int(is_raised.sum()), _ranges_of_runs(runs, is_raised)))
     return Document(
         f"Sweep of {count_noun(len(runs['status']), 'run')}",
         sweep_answer(runs),
         (
             run_tables.note_on_robot(file, model, f"Varied: {axes}."),
-            run_tables.endings_table(
-                {s: statuses[s] for s in statuses_known}, beyond_a_limit=flagged_by_status, where=ranges_by_status
-            ),
+            run_tables.endings_table(statuses, beyond_a_limit=flagged_by_status, where=ranges_by_status),
             catalogue.table("sweep.limits", rows),
             _extremes(shown_runs, extremes),
             *remarks(notes),
@@ -66,18 +76,16 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
 
 def sweep_answer(runs: Columns) -> str:
     """One sentence: number of runs with an operating point, and of those within all limits."""
-    total = len(runs["status"])
-    settled = np.isin(runs["status"], words.SETTLED)
-    is_flagged = settled & (runs["flags"] != "")
+    total, settled = len(runs["status"]), np.isin(runs["status"], words.SETTLED)
+    flags = runs["flags"][settled & (runs["flags"] != "")]
     verb = "has" if 1 in (total, settled.sum()) else "have"
     first_words = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
-    if not is_flagged.any():
+    if not len(flags):
         return f"{first_words}, all within every limit." if settled.any() else f"{first_words}."
-    raised = Counter(flag for flags in runs["flags"][is_flagged] for flag in str(flags).split(";"))
-    most_frequent, times = raised.most_common(1)[0]
+    ((most_frequent, times),) = Counter(flag for f in flags for flag in str(f).split(";")).most_common(1)
     return (
-        f"{first_words}. {is_flagged.sum()} of them {'exceeds' if is_flagged.sum() == 1 else 'exceed'} a limit. Most "
-        f"often, {words.FLAGS.get(most_frequent, most_frequent)} ({count_noun(times, 'run')})."
+        f"{first_words}. {len(flags)} of them {'exceeds' if len(flags) == 1 else 'exceed'} a limit. Most often, "
+        f"{words.FLAGS.get(most_frequent, most_frequent)} ({count_noun(times, 'run')})."
     )
 
 
@@ -150,28 +158,33 @@ def campaign_document(file: RobotFile, layout: StoreLayout, result: Json, store:
 
 
 def _sections(store: Path, layout: StoreLayout, extremes: Json) -> Iterable[Section]:
-    values, points = sample_points(store, layout)
-    yield Section("What varies", (_varied_rows(layout, values),), "varied")
+    varied, points = sample_points(store, layout)
+    yield Section("What varies", (_varied_rows(layout, varied),), "varied")
     if VERDICT in points:
-        codes, design = points[VERDICT].astype(int), layout.design
+        codes, axes = points[VERDICT].astype(int), layout.design.axes
         meanings = layout.variables[VERDICT][1]["flag_meanings"].split()
         rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
-        others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
-        figure = catalogue.figure("campaign.endings", codes, meanings, values, layout, *others)  # fmt: skip
-        figures = (figure,) * bool(others and SIZE in design.axes)
-        yield Section(
-            "How the climbs ended",
-            (
-                Note(_largest_obstacle(values, points, layout), "answer", "largest"),
-                catalogue.table("campaign.endings", rows),
-                *figures,
-            ),
-            "verdicts",
-        )
-    yield Section("What came out", tuple(_outputs(values, points, layout, extremes)), "outputs")
+        blocks: list[Block] = [
+            Note(_largest_obstacle(varied, points), "answer", "largest"),
+            catalogue.table("campaign.endings", rows),
+        ]
+        first = next((n for n in layout.design.names if n != SIZE and n in axes and len(axes[n]) > 1), None)
+        if first is not None and SIZE in axes:
+            others = (q.values == axes.get(n, q.values)[0] for n, q in varied.items() if n not in (SIZE, first))
+            at_first = np.all([np.ones(len(codes), bool), *others], axis=0)
+            drawn = (_at_points(varied, at_first)[n] for n in (first, SIZE))
+            blocks.append(catalogue.figure("campaign.endings", codes[at_first], meanings, *drawn))
+        yield Section("How the climbs ended", tuple(blocks), "verdicts")
+    yield Section("What came out", tuple(_outputs(varied, points, layout, extremes)), "outputs")
 
 
-def _outputs(values: np.ndarray, found: Columns, layout: StoreLayout, extremes: Json) -> Iterable[Block]:
+def _at_points(varied: Mapping[str, VariedQuantity], rows: np.ndarray) -> dict[str, VariedQuantity]:
+    return {name: quantity._replace(values=quantity.values[rows]) for name, quantity in varied.items()}
+
+
+def _outputs(
+    varied: Mapping[str, VariedQuantity], found: Columns, layout: StoreLayout, extremes: Json
+) -> Iterable[Block]:
     """Section on the outputs, with extremes and quantiles. The first ones are drawn."""
     settled = np.isin(found[STATUS], signals.DONE)
     rows, figures = list[tuple[Any, ...]](), list[Figure]()
@@ -184,69 +197,75 @@ def _outputs(values: np.ndarray, found: Columns, layout: StoreLayout, extremes: 
         quantiles = np.quantile(numbers, (0.05, 0.5, 0.95)) if len(numbers) else [None] * 3
         rows.append((label, unit, extremes[name]["least"], *quantiles, extremes[name]["greatest"]))
         if len(numbers) and len(figures) < DRAWN:
-            spread = catalogue.figure(
-                "campaign.spread", numbers, Column(label, unit).title, values[usable], layout,
-                finding=f"{label} against the inputs", words=(label.capitalize(),),
+            drawn = numbers, Column(label, unit).title, _at_points(varied, usable)
+            figures.append(
+                catalogue.figure(
+                    "campaign.spread", *drawn, finding=f"{label} against the inputs", words=(label.capitalize(),),
+                    suffix=name,
+                )
             )  # fmt: skip
-            figures.append(dataclasses.replace(spread, name=f"spread_{name}"))
-    suffix = "" if len(values) == layout.design.points else " drawn at random"
-    yield catalogue.note("campaign.thinned", len(values), suffix)
+    suffix = "" if len(settled) == layout.design.points else " drawn at random"
+    yield catalogue.note("campaign.thinned", len(settled), suffix)
     yield catalogue.table("campaign.ranges", rows)
     yield from figures
 
 
-def _largest_obstacle(values: np.ndarray, found: Columns, layout: StoreLayout) -> str:
+def _largest_obstacle(varied: Mapping[str, VariedQuantity], found: Columns) -> str:
     """Largest obstacle climbed and its first point, in words."""
-    names = layout.design.names
-    sizes = found[LARGEST] if LARGEST in found else values[:, names.index(SIZE)] * (found[VERDICT] == OVER)
+    sizes = found[LARGEST] if LARGEST in found else varied[SIZE].values * (found[VERDICT] == OVER)
     k = int(np.argmax(sizes))
     if sizes[k] <= 0:
         return "The robot gets over no obstacle."
     places = []
-    for name, value in zip(names, values[k], strict=True):
-        labels, unit = layout.labels.get(name), layout.coordinates[name].get("units", "").removeprefix("1")
-        places.append(f"{name} {labels[int(value)] if labels else f'{value:.4g} {unit}'.strip()}")
-    rest = ", ".join(words for name, words in zip(names, places, strict=True) if name != SIZE)
-    return f"The largest obstacle that the robot gets over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
+    for name, quantity in varied.items():
+        if name != SIZE:
+            value, unit = quantity.values[k], quantity.label.removeprefix(name).strip(" []")
+            words = quantity.words[int(value)] if quantity.words else f"{value:.4g} {unit}".strip()
+            places.append(f"{name} {words}")
+    rest = f", at {', '.join(places)}" if places else ""
+    return f"The largest obstacle that the robot gets over: {sizes[k]:.4g} mm{rest}."
 
 
-def sample_points(store: Path, layout: StoreLayout) -> tuple[np.ndarray, Columns]:
-    """Random selection of the points, always the same.
-
-    Returns:
-        Varied values, shape (points, names), and outputs by name.
-    """
+def sample_points(store: Path, layout: StoreLayout) -> tuple[dict[str, VariedQuantity], Columns]:
+    """Varied quantities and outputs by name, at a random selection of the points, always the same."""
     import zarr
 
     group: Any = zarr.open_group(store, mode="r")
-    rng, blocks = np.random.default_rng(0), layout.blocks
+    rng, blocks, design = np.random.default_rng(0), layout.blocks, layout.design
     chunks = np.sort(rng.permutation(len(blocks))[:CHUNKS])
     points_per_chunk = -(-THINNED // len(chunks))
-    values: list[np.ndarray] = []
-    values_by_name: dict[str, list[np.ndarray]] = {name: [] for name in layout.variables}
+    values, outputs = list[np.ndarray](), {name: list[np.ndarray]() for name in layout.variables}
     for chunk in map(int, chunks):
         box, count = blocks.box(chunk), blocks.count(chunk)
         rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
-        values.append(layout.design.values_in_slices(box)[rows])
-        for name, parts in values_by_name.items():
+        values.append(design.values_in_slices(box)[rows])
+        for name, parts in outputs.items():
             parts.append(group[name][box].ravel()[rows])
-    return np.concatenate(values), {name: np.concatenate(parts) for name, parts in values_by_name.items()}
+    varied = {
+        name: VariedQuantity(column, Column(name, _unit(layout, name)).title, layout.labels.get(name, ()))
+        for name, column in zip(design.names, np.concatenate(values).T, strict=True)
+    }
+    return varied, {name: np.concatenate(parts) for name, parts in outputs.items()}
 
 
-def _varied_rows(layout: StoreLayout, values: np.ndarray) -> Table:
+def _unit(layout: StoreLayout, name: str) -> str:
+    """Unit of a varied quantity, empty for a number without one."""
+    return str(layout.coordinates[name].get("units", "").removeprefix("1"))
+
+
+def _varied_rows(layout: StoreLayout, varied: Mapping[str, VariedQuantity]) -> Table:
     """Varied names in words, one row for each."""
     rows = []
-    for k, name in enumerate(layout.design.names):
-        about = layout.coordinates[name]
-        axis, labels = layout.design.axes.get(name), layout.labels.get(name)
+    for name, quantity in varied.items():
+        axis = layout.design.axes.get(name)
         if axis is None:
-            low, high = values[:, k].min(), values[:, k].max()
+            low, high = quantity.values.min(), quantity.values.max()
             text = f"{layout.design.shape[-1]:,} samples, {low:.4g} to {high:.4g}"
-        elif labels is not None:
-            text = ", ".join(labels[int(v)] for v in axis)
+        elif quantity.words:
+            text = ", ".join(quantity.words[int(v)] for v in axis)
         elif len(axis) <= 8:
             text = ", ".join(f"{v:.4g}" for v in axis)
         else:
             text = f"{axis.min():.4g} to {axis.max():.4g}, {len(axis):,} values"
-        rows.append((f"`{name}`", about["long_name"], about.get("units", "").removeprefix("1"), text))
+        rows.append((f"`{name}`", layout.coordinates[name]["long_name"], _unit(layout, name), text))
     return catalogue.table("campaign.names", rows)

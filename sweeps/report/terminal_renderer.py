@@ -33,25 +33,22 @@ def print_document(document: Document, brief: bool = False) -> None:
 
 def print_table(table: Table) -> None:
     """Prints a table without the columns and rows that only the page shows."""
-    turned_table = table.turned
-    rows = turned_table.rows if turned_table.brief is None else [turned_table.rows[k] for k in turned_table.brief]
+    turned = table.turned
+    rows = turned.rows if turned.brief is None else [turned.rows[k] for k in turned.brief]
     if table.file and len(rows) > TERMINAL_ROWS:
         print_output(f"{len(rows):,} rows: see {table.file}")
         return
     printed = rich.table.Table(title=table.title or None, title_justify="left", box=None, pad_edge=False)
-    terminal_columns = [k for k, column in enumerate(turned_table.columns) if column.terminal]
-    for k in terminal_columns:
-        column, number = turned_table.columns[k], bool(turned_table.columns[k].form)
-        short = number or max(len(plain_text(column.text(row[k]))) for row in rows) <= SHORT
-        justify: Literal["right", "left"] = "right" if number else "left"
-        printed.add_column(plain_text(column.full_title), justify=justify, no_wrap=short, overflow="fold")
-    for row in rows:
-        printed.add_row(
-            *(
-                Text(plain_text(turned_table.columns[k].text(row[k])), TONES.get(cell_tone(row[k]), ""))
-                for k in terminal_columns
-            )
-        )
+    cells: list[list[Text]] = []
+    for k, column in enumerate(turned.columns):
+        if column.terminal:
+            texts = [Text(plain_text(column.text(row[k])), TONES.get(cell_tone(row[k]), "")) for row in rows]
+            short = bool(column.form) or max(map(len, texts)) <= SHORT
+            justify: Literal["right", "left"] = "right" if column.form else "left"
+            printed.add_column(plain_text(column.full_title), justify=justify, no_wrap=short, overflow="fold")
+            cells.append(texts)
+    for row in zip(*cells, strict=True):
+        printed.add_row(*row)
     print_output(printed)
     if table.sideways and len(table.rows) > SIDE_BY_SIDE:
         print_output(f"... and {len(table.rows) - SIDE_BY_SIDE} more in {table.file}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +24,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES, Result
 from mmrjax.turning.two_sides import BETWEEN, OVER
 from sweeps.pages import words
-from sweeps.report.document import Column, Table
+from sweeps.report.document import Table, columns
 
 FULL = 2 * math.pi  # rad per turn
 #: Speed below which a motor stands [rpm], and below which a robot turns on the spot [mm/s].
@@ -73,10 +74,10 @@ def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
         unsettled = ended is None and status == STATUSES[NOT_SETTLED]
         return f"{status}: {words.NO_TURN if unsettled else words.status_meaning(status)}"
     if ended is None:
-        return _moves(row)
+        return _motion(row)
     return (
         f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "
-        f"{ended['turned_deg']:.0f}°. {_moves(row) if status == 'converged' else _now(row)}"
+        f"{ended['turned_deg']:.0f}°. {_motion(row)}"
     )
 
 
@@ -84,32 +85,24 @@ def _sloping(row: Json) -> bool:
     return float(row["slope_deg"]) != 0
 
 
-def _way(row: Json) -> str:
-    return SIDES[0] if float(row["yaw_rate_rad_s"]) > 0 else SIDES[1]
-
-
-def _now(row: Json) -> str:
-    """Motion that still changes, in words."""
-    rate, speed = float(row["yaw_rate_rad_s"]), float(row["speed_mm_s"])
-    return f"Not settled: it then moves at {speed:.0f} mm/s and turns to the {_way(row)} at {abs(rate):.2f} rad/s."
-
-
-def _moves(row: Json) -> str:
+def _motion(row: Json) -> str:
+    """Motion at the end, in words."""
     rate, radius, speed = (float(row[c]) for c in ("yaw_rate_rad_s", "turning_radius_mm", "speed_mm_s"))
+    way, size = SIDES[int(rate <= 0)], abs(rate)
+    if row["status"] != "converged":
+        return f"Not settled: it then moves at {speed:.0f} mm/s and turns to the {way} at {size:.2f} rad/s."
     if not math.isfinite(radius):
         return f"Straight at {speed:.0f} mm/s."
     if _sloping(row):
         return (
-            f"At this heading the forward speed is {speed:.0f} mm/s and the yaw rate {abs(rate):.2f} rad/s to "
-            f"the {_way(row)}. On a slope a turn is not a circle."
+            f"At this heading the forward speed is {speed:.0f} mm/s and the yaw rate {size:.2f} rad/s to the {way}. "
+            "On a slope a turn is not a circle."
         )
     if abs(speed) < SPOT:
-        minute = 60 / FULL * abs(rate)
-        return f"Turns on the spot to the {_way(row)} at {abs(rate):.2f} rad/s, {minute:.1f} turns a minute."
-    backward = "backward " if speed < 0 else ""
+        return f"Turns on the spot to the {way} at {size:.2f} rad/s, {60 / FULL * size:.1f} turns a minute."
     return (
-        f"Turns {backward}to the {_way(row)} on a circle of {abs(radius):.0f} mm radius, at {abs(speed):.0f} mm/s "
-        f"and {abs(rate):.2f} rad/s, one turn in {FULL / abs(rate):.1f} s."
+        f"Turns {'backward ' * (speed < 0)}to the {way} on a circle of {abs(radius):.0f} mm radius, at "
+        f"{abs(speed):.0f} mm/s and {size:.2f} rad/s, one turn in {FULL / size:.1f} s."
     )
 
 
@@ -207,17 +200,17 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
     return Postures(table, level, Drawn(step.side, float(step.base), float(step.height)), best)
 
 
-#: Columns of the page's table: heading, format.
+#: Columns of the page's table.
 COLUMNS = {
-    "levers_front_deg": ("front levers [°]", "{:g}"), "levers_rear_deg": ("rear levers [°]", "{:g}"),
-    "pitch_deg": ("pitch [°]", "{:.1f}"), "contact_mm": ("contact [mm]", "{:.0f}"), "bears": ("bears", "{}"),
-    "load_front_percent": ("load at the front [%]", "{:.0f}"),
-    "centre_height_mm": ("centre of mass over the ground [mm]", "{:.1f}"), "margin_mm": ("margin [mm]", "{:.0f}"),
-    "tips_back_deg": ("tips back on [°]", "{:.1f}"), "tips_forward_deg": ("tips forward on [°]", "{:.1f}"),
-    "tips_aside_deg": ("tips aside on [°]", "{:.1f}"), "highest_step_mm": ("highest step [mm]", "{:.0f}"),
-    "widest_gap_mm": ("widest gap [mm]", "{:.0f}"), "tip_front_mm": ("front tip up to [mm]", "{:.0f}"),
-    "tip_rear_mm": ("rear tip up to [mm]", "{:.0f}"), "overall_length_mm": ("length [mm]", "{:.0f}"),
-    "overall_height_mm": ("height [mm]", "{:.0f}"),
+    "levers_front_deg": "front levers [°] | g", "levers_rear_deg": "rear levers [°] | g",
+    "pitch_deg": "pitch [°] | .1f", "contact_mm": "contact [mm] | .0f", "bears": "bears |",
+    "load_front_percent": "load at the front [%] | .0f",
+    "centre_height_mm": "centre of mass over the ground [mm] | .1f", "margin_mm": "margin [mm] | .0f",
+    "tips_back_deg": "tips back on [°] | .1f", "tips_forward_deg": "tips forward on [°] | .1f",
+    "tips_aside_deg": "tips aside on [°] | .1f", "highest_step_mm": "highest step [mm] | .0f",
+    "widest_gap_mm": "widest gap [mm] | .0f", "tip_front_mm": "front tip up to [mm] | .0f",
+    "tip_rear_mm": "rear tip up to [mm] | .0f", "overall_length_mm": "length [mm] | .0f",
+    "overall_height_mm": "height [mm] | .0f",
 }  # fmt: skip
 #: Most rows of that table.
 ROWS = 20
@@ -225,10 +218,12 @@ ROWS = 20
 
 def posture_table(found: Postures, names: Sequence[str]) -> Table:
     """Postures of the first runs, one row for each."""
-    shown = {c: about for c, about in COLUMNS.items() if c in found.table}
-    rows = zip(names[:ROWS], *(found.table[c][:ROWS] for c in shown), strict=True)
-    columns = (Column("run"), *(Column(heading, form=form) for heading, form in shown.values()))
-    return Table("posture", columns, list(rows), file="posture.csv", sideways=True)
+    cells: dict[str, Any] = {
+        "run": names,
+        **{title: found.table[c] for c, title in COLUMNS.items() if c in found.table},
+    }
+    rows = list(zip(*(values[:ROWS] for values in cells.values()), strict=True))
+    return Table("posture", columns(*cells), rows, file="posture.csv", sideways=True)
 
 
 def posture_sentences(found: Postures) -> str:
@@ -245,14 +240,8 @@ def posture_sentences(found: Postures) -> str:
 
 def tipping_remarks(found: Postures) -> list[str]:
     """Remarks on runs that would tip over, because the numbers of straight travel do not show it."""
-    tipping_runs = np.flatnonzero(found.table["margin_mm"] < 0)
-    if not tipping_runs.size:
-        return []
-    run_words = (
-        "the run"
-        if len(found.table["margin_mm"]) == 1
-        else "runs " + ", ".join(str(k + 1) for k in tipping_runs[:ROWS])
-    )
-    return [
-        f"posture: {run_words} would tip over on that slope. Currents and speeds are those of a robot held upright"
-    ]
+    margin = found.table["margin_mm"]
+    numbers = ", ".join(str(k + 1) for k in np.flatnonzero(margin < 0)[:ROWS])
+    who = "the run" if len(margin) == 1 else f"runs {numbers}"
+    sentence = f"posture: {who} would tip over on that slope. Currents and speeds are those of a robot held upright"
+    return [sentence] * bool(numbers)

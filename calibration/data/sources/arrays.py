@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import zipfile
 import zlib
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -48,7 +48,7 @@ def signals_of_npy(path: Path, name: str) -> tuple[Signal, ...]:
         shape, dtype = _read_npy_header(stream)
     loaded = functools.cache(lambda: np.load(path, allow_pickle=False))
     signals = signals_of_arrays(name, {path.stem: (shape, dtype, loaded)})
-    fields = (dataclasses.replace(s, path=s.path.removeprefix(f"{path.stem}.")) for s in signals)
+    fields = (replace(s, path=s.path.removeprefix(f"{path.stem}.")) for s in signals)
     return tuple(fields) if dtype.names else signals
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,7 @@ def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
             stamps = dataset.coords[time]
             clock = Clock(time, _values(stamps), str(stamps.attrs.get("units", "")) or unit_of_clock(time) or "")
         of_array = signals_of_arrays("the Dataset", {name: stored}, {name: unit})
-        signals += [dataclasses.replace(s, clock=clock) for s in of_array]
+        signals += [replace(s, clock=clock) for s in of_array]
     return tuple(signals)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 import fnmatch
 import hashlib
 import importlib
@@ -12,6 +11,7 @@ import os
 import stat
 import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from calibration.data.sources.recorded_signals import Clock, Load, Signal, Sourc
 WITHIN = "::"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Format:
     """A format of files.
 
@@ -208,7 +208,7 @@ def checked_source(
     input_files.check_declared(name, len(signals), size, held)
     count = collections.Counter(signal.path for signal in signals)
     why = "has the same name as another signal; expected different names"
-    signals = [s if count[s.path] == 1 else dataclasses.replace(s, refused=why) for s in signals]
+    signals = [s if count[s.path] == 1 else replace(s, refused=why) for s in signals]
     return Source(name, kind, _guarded_signals(signals, name, kind), digest)
 
 
@@ -243,8 +243,7 @@ def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[S
     clocks: dict[int, Clock] = {}
     for s in signals:
         if s.clock is not None and id(s.clock) not in clocks:
-            clocks[id(s.clock)] = dataclasses.replace(s.clock, load=guarded(s.clock.load, s.clock.name, s))
+            clocks[id(s.clock)] = replace(s.clock, load=guarded(s.clock.load, s.clock.name, s))
     return tuple(
-        dataclasses.replace(s, load=guarded(s.load, s.path, s, s.refused), clock=clocks.get(id(s.clock)))
-        for s in signals
+        replace(s, load=guarded(s.load, s.path, s, s.refused), clock=clocks.get(id(s.clock))) for s in signals
     )

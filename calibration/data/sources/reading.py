@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +128,7 @@ def _with_header(arrays: NamedArrays, header: Names) -> NamedArrays:
         return arrays
     values = tuple([first, *rest] for first, rest in zip(arrays.header, arrays.values, strict=True))
     note = f"{arrays.name}: has no header. Its columns are read as {', '.join(header)}"
-    return dataclasses.replace(arrays, header=header, values=values, notes=(*arrays.notes, note))
+    return replace(arrays, header=header, values=values, notes=(*arrays.notes, note))
 
 
 def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset) -> ReadColumns:
@@ -144,7 +144,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset) -> ReadColum
     notes = (*arrays.notes, *notes, *weakened_field_notes(columns, by_name))
     values = tuple(map(_decode_raw_numbers, map(columns.column_of, arrays.header), arrays.values))
     mapped = presets_file.merge_columns(mapped, layout.mapped)
-    return dataclasses.replace(arrays, values=values, notes=notes), mapped
+    return replace(arrays, values=values, notes=notes), mapped
 
 
 def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
@@ -225,7 +225,7 @@ def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dic
         else:
             near = suggested_paths(pattern, [s.path for s in source.signals])
             missing.append(f"{source.name}: no signal {pattern}, from which {own_column} is read; {near}")
-    spellings = dataclasses.replace(layout, channels=channels.EVERY, mapped=()).spellings()
+    spellings = replace(layout, channels=channels.EVERY, mapped=()).spellings()
     spelled = {name.casefold() for name in spellings}
     used_signals = {id(signal) for signal in signals_by_column.values()}
     for signal in source.signals:
@@ -248,7 +248,7 @@ def _decode_raw_numbers(column: presets_file.PresetColumn, raw: Raw) -> Raw:
 
 def _decoded_signal(column: presets_file.PresetColumn, signal: Signal) -> Signal:
     """Signal whose values are decoded before they are interpolated."""
-    return dataclasses.replace(signal, load=lambda: np.asarray(_decode_raw_numbers(column, signal.load())))
+    return replace(signal, load=lambda: np.asarray(_decode_raw_numbers(column, signal.load())))
 
 
 def _extra_columns(source: Source, chosen: Mapping[str, Signal]) -> dict[str, Signal]:
@@ -282,7 +282,7 @@ def _on_a_grid(
     source: Source, chosen: Mapping[str, Signal], layout: Layout, between: str, clock: str, mapped: Mapped
 ) -> tuple[Columns, Names]:
     """Values of signals with separate clocks, on one grid."""
-    meanings = dataclasses.replace(layout, mapped=mapped).meanings(source.name, list(chosen))
+    meanings = replace(layout, mapped=mapped).meanings(source.name, list(chosen))
     column_of = {c: "" if m is None else m.column for c, m in zip(chosen, meanings, strict=True)}
     signals = {c: s for c, s in chosen.items() if column_of[c] not in TIME}
     over_time = {c: s for c, s in signals.items() if s.clock is not None}

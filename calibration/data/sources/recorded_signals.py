@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fnmatch
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -34,7 +34,7 @@ _COUNTS = {"millis": "ms", "micros": "us", "nanos": "ns"}
 _WORDS_OF_UNITS = {"sec": "s", "seconds": "s", "millis": "ms", "micros": "us"}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Clock:
     """Time stamps that several signals share.
 
@@ -49,7 +49,7 @@ class Clock:
     unit: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Signal:
     """One signal of a recording.
 
@@ -263,7 +263,7 @@ def _of_array(
     return [Signal(p, n, part, unit, clock, words, refused, size) for p, part in parts.items()]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Source:
     """Recording or table: its signals, and notes on how it was read.
 
@@ -294,4 +294,4 @@ class Source:
         if not signals_below:
             groups = dict.fromkeys(parent_path(s.path).rstrip("/.") or s.path for s in self.signals)
             raise BadData(f"{self.name}::{prefix}: no such signal; {suggested_paths(prefix, list(groups))}")
-        return dataclasses.replace(self, signals=signals_below)
+        return replace(self, signals=signals_below)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import dataclasses
 import functools
 import io
 import logging
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def signals_of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
     clock = signals[0].clock if signals else None
     if clock is None or any(s.clock is not clock for s in signals):
         return tuple(signals)
-    table = (dataclasses.replace(s, clock=None) for s in signals)
+    table = (replace(s, clock=None) for s in signals)
     return (Signal("time_s", signals[0].length, clock.load, "s"), *table)
 
 

@@ -96,7 +96,7 @@ class Observer(eqx.Module):
         """Row indices, padded by repeating the first row, see `sizes_padded`. Also True for each without padding."""
         sizes = cls.sizes_padded
         size = next((s for s in sizes if s >= rows), rows + (-rows % sizes[-1] if sizes else 0))
-        index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
+        index = np.pad(np.arange(rows), (0, size - rows))
         return index, np.arange(size) < rows
 
     @classmethod

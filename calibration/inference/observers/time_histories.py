@@ -611,7 +611,7 @@ class Histories(Observer):
         unended = ~np.asarray(optima[0].converged) & (np.asarray(optima[0].steps) >= steps)
         if most is None and np.any(near & unended):  # a proposal has to be an optimum
             optima = search_from(np.asarray(optima[0].z))
-        if not rivals or not scans.scanned_coordinates(problem):
+        if not rivals or not self.scanned(problem):
             return optima
         k = int(np.nanargmin(optima[0].cost))
         if most is not None and not optima[0].converged[k] and np.abs(optima[0].z[k]).max() > LOST:

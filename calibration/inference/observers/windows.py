@@ -21,8 +21,8 @@ from jaxtyping import Array, Float, Int
 from calibration.data import Columns, Names
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
+from calibration.inference.lack_of_fit import variance_of_sums
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect
-from calibration.inference.noise_factor import variance_of_sums
 from calibration.inference.observers.linear_rows import LinearRows, grid_of_effects
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.problem import Problem, data_from_readings
