@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_rig_histories import ARM, DRIVE
+from test_rig_histories import ARM, DRIVE, USUAL
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -34,7 +34,7 @@ def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who, robot):
 def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     """Signs and steps that a rig's file leaves to its table: campaigns left them open."""
     path = tmp_path / "rig.toml"
-    text = DRIVE.format(imposed="voltage", channels='"total_current"', start="rest")
+    text = DRIVE.format(channels='"total_current"', **USUAL)
     text += '[instruments.total_current]\nsigned = "free"\nquantum = "free"\n'
     robot = robot_file.load_robot(text_file(path, text + ARM))
     assert robot.rig.instruments[0].free

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from test_rig_histories import BENCH, DRIVE, history
+from test_rig_histories import drive, history
 
 from calibration.inference import noise, observers, priors, scans
 from calibration.inference.calibration import calibrate
@@ -16,7 +16,6 @@ from calibration.inference.observers import time_histories
 from calibration.inference.optimizers import evaluate_residuals
 from calibration.inference.scans import Scan
 from mmrjax.model import params
-from tests.commands import read_rig
 
 OPTIONS = {"model": "drive", "starts": 1, "blocks": False, "profiles": False}
 TRUTH = 0.0312
@@ -26,9 +25,7 @@ TRUTH = 0.0312
 def coarse(tmp_path_factory):
     """A bench whose current rises within a millisecond and is read every 20 ms, 31 ms late."""
     folder = tmp_path_factory.mktemp("coarse")
-    text = DRIVE.format(imposed="voltage", channels='"total_current"', start="rest") + BENCH
-    text = text.replace("resistance = 3.0", "resistance = 3.0\ninductance = 1e-3").replace("0 ± 0.05", "0 ± 0.02")
-    robot = read_rig(folder, text)
+    robot = drive(folder, "total_current", motor="inductance = 1e-3", rig='delay = "0 ± 0.02"')
     truth = params.replace(robot, {"rig.delay": TRUTH, "bench.loss_coulomb": 0.24})
     t = np.arange(0, 0.32, 0.02)
     columns = {"time_s": t, "supply_voltage_V": np.where(t < 0.16, 12.0, 6.0)}

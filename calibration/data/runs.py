@@ -281,7 +281,7 @@ def _reject_readings(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Lay
         why = " together with --battery, whose charge sets the voltage; leave the cell empty or remove the column"
     else:
         is_given &= column_numbers(raw) != 0
-        why = "; the load is a shaft, on which it does not act. Remove the column, or describe a vehicle"
+        why = "; the robot's load is a shaft, on which it does not act. Remove the column, or describe a vehicle"
         if layout.has_ground:
             why = f"; {NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
     for row in np.flatnonzero(is_given)[:1].tolist():
