@@ -228,4 +228,4 @@ def test_comparison_shows_its_rows_and_escapes_its_title(tmp_path):
     rows = tables["rowtable"][2:]
     assert len(rows) == 20
     assert sum("slides" in row for row in rows) == 6
-    assert rows[0][7] == f"{table['simulated_total_current_A'][0]:.2f}"
+    assert rows[0][6] == f"{table['simulated_total_current_A'][0]:.2f}"

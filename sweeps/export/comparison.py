@@ -421,7 +421,7 @@ def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:
-        raise BadData(f"{runs.source}: its runs drive the sides differently; expected straight travel")
+        raise BadData(f"{runs.source}: expected straight travel, not turns")
     if levers := [name for name in runs.axes if name.startswith("lever")]:
         raise BadData(f"{runs.source}, {levers[0]}: an export is one drive; expected runs without lever columns")
     if runs.sampled:

@@ -77,7 +77,7 @@ def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
         return _motion(row)
     return (
         f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "
-        f"{ended['turned_deg']:.0f}°. {_motion(row)}"
+        f"{ended['turned_deg']:.0f}°. {_motion(row, status == 'converged')}"
     )
 
 
@@ -85,11 +85,11 @@ def _sloping(row: Json) -> bool:
     return float(row["slope_deg"]) != 0
 
 
-def _motion(row: Json) -> str:
+def _motion(row: Json, settled: bool = True) -> str:
     """Motion at the end, in words."""
     rate, radius, speed = (float(row[c]) for c in ("yaw_rate_rad_s", "turning_radius_mm", "speed_mm_s"))
     way, size = SIDES[int(rate <= 0)], abs(rate)
-    if row["status"] != "converged":
+    if not settled:
         return f"Not settled: it then moves at {speed:.0f} mm/s and turns to the {way} at {size:.2f} rad/s."
     if not math.isfinite(radius):
         return f"Straight at {speed:.0f} mm/s."
