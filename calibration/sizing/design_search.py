@@ -42,8 +42,8 @@ CELLS, PARALLEL, RADIUS = (3, 14), (1.0, 12.0), (0.6, 1.3)
 TRIES = 6
 #: Rows of one call of `_evaluate_designs`.
 ROWS = 8192
-#: Number of designs refined with any ratio and fractions of a cell, points along each axis, rounds, and shrinkage of
-#: the box per round.
+#: Number of designs refined with any ratio and fractions of a cell, after one of each choice with three points along
+#: each axis. Points along each axis, rounds, and shrinkage of the box per round.
 REFINED, ALONG, ROUNDS, SHRINK = 48, 7, 7, 0.45
 #: Half width of the first box [ratio of each number, logarithm].
 WIDTH = 0.25
@@ -232,21 +232,26 @@ def size_robot(
     unmeetable = tuple(label for label, k in zip(problem.labels, is_feasible, strict=True) if not k)
     first = np.eye(len(OBJECTIVES))[columns[0]]
 
-    def refined(rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: Names) -> _EvaluatedDesigns:
-        return _refine_designs(problem, choice, rows, x, is_feasible, weights, free)
+    def refined(designs: _EvaluatedDesigns, weights: np.ndarray, free: Names, along: int) -> _EvaluatedDesigns:
+        return _refine_designs(problem, choice, designs, is_feasible, weights, free, along)
+
+    def best_of(designs: _EvaluatedDesigns, count: int, weights: np.ndarray) -> np.ndarray:
+        return np.argsort(_cost(designs, is_feasible, weights))[:count]
 
     tell(progress_remark("whole"))
     tried = _catalogue_designs(problem, choice, _promising_choices(drawn, is_feasible, columns))
     shares = SHARES if len(columns) == 2 else SHARES[:1]
     weights = np.outer(1 - shares, first) + np.outer(shares, np.eye(len(OBJECTIVES))[columns[-1]])
-    best = [np.argsort(_cost(tried, is_feasible, w))[:KEPT_WHOLE] for w in weights]
-    rows = np.concatenate(best)
-    buildable = refined(tried.rows[rows], tried.x[rows], np.repeat(weights, len(best[0]), axis=0), ("radius",))
+    best = np.concatenate([best_of(tried, KEPT_WHOLE, w) for w in weights])
+    of_best = np.repeat(weights, len(best) // len(weights), axis=0)
+    buildable = refined(tried.part(best), of_best, ("radius",), ALONG)
     tell(progress_remark("refined", REFINED))
-    starts = [d.part(np.argsort(_cost(d, is_feasible, first))[: REFINED // 2]) for d in (drawn, buildable)]
-    rows, x = (np.concatenate([getattr(d, name) for d in starts]) for name in ("rows", "x"))
-    free = refined(rows, x, np.tile(first, (len(rows), 1)), CONTINUOUS)
-    evaluated = sum(d.evaluated for d in (drawn, tried, buildable, free))
+    ranked = best_of(drawn, len(drawn.rows), first)
+    of_choice = np.sort(np.unique(drawn.rows[ranked], return_index=True)[1])  # the best design of each choice
+    coarse = refined(drawn.part(ranked[of_choice[:WHOLE]]), first, CONTINUOUS, 3)
+    free = coarse.part(best_of(coarse, REFINED // 2, first)) + buildable.part(best_of(buildable, REFINED // 2, first))
+    free = refined(free, first, CONTINUOUS, ALONG)
+    evaluated = sum(d.evaluated for d in (drawn, tried, buildable, coarse, free))
 
     def sized(designs: _EvaluatedDesigns, k: int) -> SizedDesign:
         margins = np.where(is_feasible, designs.g[k], np.nan)
@@ -258,14 +263,14 @@ def size_robot(
         name = part_options.drives[choice.drive[designs.rows[k]]].motor.name
         if name not in by_motor:  # building robots for all thousand designs takes time
             by_motor[name] = sized(designs, k)
-    order = np.argsort(_cost(buildable, is_feasible, first))
+    order = best_of(buildable, len(buildable.rows), first)
     good = [int(k) for k in order if np.all(buildable.g[k][is_feasible] >= 0)]
     different: dict[tuple[int, int], int] = {}
     for k in good:
         row = buildable.rows[k]
         different.setdefault((int(choice.drive[row]), int(choice.cell[row])), k)
     designs_found = [sized(buildable, k) for k in list(different.values())[:8]]
-    ideal = int(np.argmin(_cost(free, is_feasible, first)))
+    ideal = best_of(free, 1, first)[0]
     front = _pareto_front(buildable.f[:, columns], good) if len(columns) == 2 else []
     return SizingResult(
         problem, part_options, objectives[0], unmeetable,
@@ -291,6 +296,13 @@ class _EvaluatedDesigns:
     f: np.ndarray
     g: np.ndarray
     evaluated: int
+
+    def __add__(self, other: _EvaluatedDesigns) -> _EvaluatedDesigns:
+        rows, x, f, g = (
+            np.concatenate(pair)
+            for pair in ((self.rows, other.rows), (self.x, other.x), (self.f, other.f), (self.g, other.g))
+        )
+        return _EvaluatedDesigns(rows, x, f, g, self.evaluated + other.evaluated)
 
     def part(self, k: np.ndarray) -> _EvaluatedDesigns:
         """Some of the designs."""
@@ -334,27 +346,29 @@ def _catalogue_designs(problem: SizingTask, choice: ChoiceSpace, rows: np.ndarra
 
 
 def _refine_designs(
-    problem: SizingTask, choice: ChoiceSpace, rows: np.ndarray, x: np.ndarray, kept: np.ndarray, weights: np.ndarray,
-    free: Names,
+    problem: SizingTask, choice: ChoiceSpace, designs: _EvaluatedDesigns, kept: np.ndarray, weights: np.ndarray,
+    free: Names, along: int,
 ) -> _EvaluatedDesigns:  # fmt: skip
     """Best designs in shrinking boxes around the given ones.
 
     Args:
         kept: True for limits that at least one design meets.
-        weights: weights of the objectives for each design, shape (designs, objectives).
+        weights: weights of the objectives, of all designs or of each.
         free: the numbers of `CONTINUOUS` that may move.
+        along: number of points along each axis of a box.
     """
-    axes = [np.linspace(-WIDTH, WIDTH, ALONG) if name in free else np.zeros(1) for name in CONTINUOUS]
+    axes = [np.linspace(-WIDTH, WIDTH, along) if name in free else np.zeros(1) for name in CONTINUOUS]
     box = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    n = len(box)
-    rows_of_box, weights_of_box = np.repeat(rows, n), np.repeat(weights, n, axis=0)
+    count, n, x = len(designs.rows), len(box), designs.x
+    rows = np.repeat(designs.rows, n)
+    weights = np.repeat(np.broadcast_to(weights, (count, len(OBJECTIVES))), n, axis=0)
     for _ in range(ROUNDS):
-        candidates = np.clip(x[:, None] + box, choice.low[rows][:, None], choice.high[rows][:, None]).reshape(-1, 3)
-        f, g = evaluate_designs(problem, choice, rows_of_box, candidates)
-        cost = _cost(_EvaluatedDesigns(rows_of_box, candidates, f, g, 0), kept, weights_of_box).reshape(-1, n)
-        best = np.arange(len(rows)) * n + np.argmin(cost, axis=1)
+        candidates = np.clip((x[:, None] + box).reshape(-1, 3), choice.low[rows], choice.high[rows])
+        f, g = evaluate_designs(problem, choice, rows, candidates)
+        cost = _cost(_EvaluatedDesigns(rows, candidates, f, g, 0), kept, weights).reshape(count, n)
+        best = np.arange(count) * n + np.argmin(cost, axis=1)
         x, box = candidates[best], box * SHRINK
-    return _EvaluatedDesigns(rows, x, f[best], g[best], ROUNDS * len(rows_of_box))
+    return _EvaluatedDesigns(designs.rows, x, f[best], g[best], ROUNDS * len(rows))
 
 
 def _cost(designs: _EvaluatedDesigns, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
