@@ -246,9 +246,9 @@ def size_robot(
     of_best = np.repeat(weights, len(best) // len(weights), axis=0)
     buildable = refined(tried.part(best), of_best, ("radius",), ALONG)
     tell(progress_remark("refined", REFINED))
-    ranked = best_of(drawn, len(drawn.rows), first)
-    of_choice = np.sort(np.unique(drawn.rows[ranked], return_index=True)[1])  # the best design of each choice
-    coarse = refined(drawn.part(ranked[of_choice[:WHOLE]]), first, CONTINUOUS, 3)
+    by_cost = best_of(drawn, len(drawn.rows), first)
+    of_choice = np.sort(np.unique(drawn.rows[by_cost], return_index=True)[1])  # the best design of each choice
+    coarse = refined(drawn.part(by_cost[of_choice[:WHOLE]]), first, CONTINUOUS, 3)
     free = coarse.part(best_of(coarse, REFINED // 2, first)) + buildable.part(best_of(buildable, REFINED // 2, first))
     free = refined(free, first, CONTINUOUS, ALONG)
     evaluated = sum(d.evaluated for d in (drawn, tried, buildable, coarse, free))
