@@ -204,10 +204,10 @@ def test_bootstrap_leaves_what_noise_leaves(seen):
 
 
 @pytest.mark.slow
-def test_linear_bootstrap_is_that_of_refits(clean):
+def test_linear_bootstrap_is_that_of_refits(clean, seen):
     """Statistics of replicates by the linear refit, against a few histories drawn and fitted again in full."""
     is_of_noise(clean.left.test.null, 3 * len(clean.runs))
-    problem, z = clean.space.bare, jnp.asarray(clean.base.z[: clean.space.free])
+    problem, z = seen.problem, seen.z
     draw = jax.random.normal(jax.random.key(3), (6, *problem.data.measured.shape))
     clean_reading = problem.observation(z).reading
 

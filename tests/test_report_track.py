@@ -66,7 +66,8 @@ def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, wri
     from mmrjax.fidelities.steady import steady
 
     said = re.search(r'id="guide-share">(.*?)</p>', written[1], re.S).group(1)
-    here, there = re.search(r"draws ([\d.]+) A here and ([\d.]+) A by the steady model", said).groups()
+    figures = re.search(r"draws ([\d.]+) A here and ([\d.]+) A by the steady model", said).groups()
+    here, there = map(float, figures)
     assert here == pytest.approx(written[2].result.total_current[0], abs=0.006)
     assert there == pytest.approx(float(steady(robot, Conditions(voltage=33.0)).total_current), abs=0.006)
     assert here > 1.2 * float(there) and "0.3 for this robot" in said

@@ -117,7 +117,7 @@ def test_idle_current_balances_the_losses_by_hand(robot):
 @pytest.mark.slow
 def test_stages_follow_the_slide(robot):
     for start in data.simulate_starts(robot):
-        assert 0 < start.starting < start.slipping < start.time[-1]
+        assert 0 < start.stages.starting < start.stages.slipping < start.time[-1]
         sliding = start.theoretical - start.speed
-        assert np.all(sliding[start.time > start.slipping] <= 20.0 + 1e-6)  # V_s [mm/s]
-        assert sliding[np.searchsorted(start.time, start.starting)] == sliding.max()
+        assert np.all(sliding[start.time > start.stages.slipping] <= 20.0 + 1e-6)  # V_s [mm/s]
+        assert sliding[np.searchsorted(start.time, start.stages.starting)] == sliding.max()

@@ -15,7 +15,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.linearization import balance_probe
-from calibration.inference.observers import time_histories as histories_room
+from calibration.inference.observers import run_grids
 from calibration.inference.observers.time_histories import Histories
 from mmrjax.effects import UNNAMED
 from mmrjax.fidelities import histories as integrator
@@ -282,7 +282,7 @@ def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path
     conditions = made.conditions
     assert conditions.motor_speed.shape == conditions.motor_acceleration.shape == made.times.shape
     assert conditions.configuration.shape == conditions.voltage.shape == (count,)
-    assert made.angle(made.whole(robot)).shape == (len(runs),)
+    assert made.signals_and_angle(robot)[1].shape == (len(runs),)
 
 
 def test_every_row_of_an_imposed_speed_has_the_acceleration_of_the_motion_there(tmp_path):
@@ -339,8 +339,8 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     runs = read_table(tmp_path, csv_text(driven), robot)
     made = observers.observer_kind(runs).of(runs, robot)
     shown = np.asarray(made(robot).reading)
-    monkeypatch.setattr(histories_room, "CHANGE", (1e-6, 0.1))
-    monkeypatch.setattr(histories_room, "LONGEST", 5e-5)
+    monkeypatch.setattr(run_grids.histories, "CHANGE", (1e-6, 0.1))
+    monkeypatch.setattr(run_grids, "LONGEST", 5e-5)
     fine = observers.observer_kind(runs).of(runs, robot)
     exact = np.asarray(fine(robot).reading)
     assert made.times.size < 7 * len(runs) and 25 * made.times.size < fine.times.size

@@ -186,7 +186,7 @@ def test_command_leaves_what_its_schema_says(folder):
     front = [(f["objectives"]["mass"], f["objectives"]["energy"]) for f in result["pareto"]]
     assert len(front) > 1 and front == sorted(front) and all(a[1] > b[1] for a, b in itertools.pairwise(front))
     assert result["best"]["objectives"]["mass"] == pytest.approx(front[0][0])
-    assert all(r["met"] for r in result["requirements"]) and result["starts"] == 256
+    assert all(r["met"] for r in result["requirements"])
     sized = robot_file.load_robot(str(folder / "robot.toml"))
     assert sized.gearbox.ratio == pytest.approx(result["best"]["ratio"])
     assert sized.battery.cells == result["best"]["cells"]

@@ -1,5 +1,6 @@
 """Tables of runs and draws of a posterior as sweeps: their points, chunks that are taken up again, runs in parts."""
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data.runs import Runs
 from mmrjax import fidelities
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps import config
@@ -60,7 +62,7 @@ def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, poster
 @pytest.mark.parametrize("chunk", [None, 3])
 def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
     found = run.evaluate_runs(robot, runs, chunked(chunk), None)
-    alone = run.ending_columns(robot, run.SimulationResult(steady_batch(robot, runs.conditions(robot))))
+    alone = run.ending_columns(robot, RunBatch(steady_batch(robot, runs.conditions(robot))))
     same({name: found[name] for name in alone}, alone, rtol=1e-12)
     assert found["status"].tolist() == ["converged"] * 3 + ["slides"]
     assert found["total_mass_kg"][1] == float(robot.configurations.members[1].mass) + 3
@@ -129,7 +131,8 @@ def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monke
         fidelities.TABLE, "steady", dataclasses.replace(fidelities.fidelity_facts("steady"), slow=True)
     )
     monkeypatch.setattr(steady, "FIDELITY", dataclasses.replace(honest, run=in_two))
-    found = run.evaluate_runs(robot, runs, chunked(2), None, said.append)
+    monkeypatch.setattr(run, "progress_bar", lambda *_, **__: contextlib.nullcontext(said.append))
+    found = run.evaluate_runs(robot, runs, chunked(2), None)
     same(found, plain, rtol=1e-12)
     assert said.count(1.0) == 4 and sum(said) == 4  # two chunks, two parts each
 

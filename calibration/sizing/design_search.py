@@ -247,8 +247,10 @@ def size_robot(
     buildable = refined(tried.part(best), of_best, ("radius",), ALONG)
     tell(progress_remark("refined", REFINED))
     by_cost = best_of(drawn, len(drawn.rows), first)
-    of_choice = np.sort(np.unique(drawn.rows[by_cost], return_index=True)[1])  # the best design of each choice
-    coarse = refined(drawn.part(by_cost[of_choice[:WHOLE]]), first, CONTINUOUS, 3)
+    motors_of_choices = np.array([part_options.drives[k].motor.name for k in choice.drive])
+    best_choices = np.sort(np.unique(drawn.rows[by_cost], return_index=True)[1])[:WHOLE]
+    of_motors = np.unique(motors_of_choices[drawn.rows[by_cost]], return_index=True)[1]
+    coarse = refined(drawn.part(by_cost[np.union1d(best_choices, of_motors)]), first, CONTINUOUS, 3)
     free = coarse.part(best_of(coarse, REFINED // 2, first)) + buildable.part(best_of(buildable, REFINED // 2, first))
     free = refined(free, first, CONTINUOUS, ALONG)
     evaluated = sum(d.evaluated for d in (drawn, tried, buildable, coarse, free))
@@ -257,10 +259,10 @@ def size_robot(
         margins = np.where(is_feasible, designs.g[k], np.nan)
         return _sized_design(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
 
-    ranked = [(c, d, k) for d in (free, buildable) for k, c in enumerate(_cost(d, is_feasible, first))]
+    ranked = [(c, d, k) for d in (free, buildable, coarse) for k, c in enumerate(_cost(d, is_feasible, first))]
     by_motor = dict[str, SizedDesign]()
     for _, designs, k in sorted(ranked, key=lambda c: c[0]):
-        name = part_options.drives[choice.drive[designs.rows[k]]].motor.name
+        name = str(motors_of_choices[designs.rows[k]])
         if name not in by_motor:  # building robots for all thousand designs takes time
             by_motor[name] = sized(designs, k)
     order = best_of(buildable, len(buildable.rows), first)

@@ -176,13 +176,19 @@ def endings_table(
 
 
 def operating_points(robot: Robot, runs: Columns) -> Columns:
-    """Torque at the gearbox output, speed and current of one motor in settled runs, from columns of `runs.csv`."""
+    """Torque at the gearbox output, speed and current of one motor in settled runs, from columns of `runs.csv`.
+
+    The current is left out if it is imposed.
+    """
     radius = np.array([float(robot.configurations[name].radius) for name in runs["configuration"]])
     output = runs["theoretical_speed_mm_s"] / 1e3 / radius
     with np.errstate(divide="ignore", invalid="ignore"):
         torque = runs["power_gear_W"] / float(robot.sides) / output
     speed = output * float(robot.gearbox.ratio) / RPM
-    return {"torque_Nm": torque, "motor_rpm": speed, "motor_A": runs["total_current_A"] / float(robot.sides)}
+    points = {"torque_Nm": torque, "motor_rpm": speed}
+    if "total_current_A" in runs:
+        points["motor_A"] = runs["total_current_A"] / float(robot.sides)
+    return points
 
 
 def limits_table(limits: Sequence[Json], what: str) -> Table:
