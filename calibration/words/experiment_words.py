@@ -160,13 +160,14 @@ def _repeat_instruction(happens: bases.Window) -> str:
     """The same runs, where something happens for a while or at one level."""
     if happens.axis == "order":
         return (
-            f"Repeat runs {happens.low:.0f} to {happens.high:.0f} in another order, among as many others. An error "
-            "that returns depends on their conditions"
+            f"Repeat runs {happens.low:.0f} to {happens.high:.0f} in a different order, mixed with as many other runs. "
+            "If the error returns, their conditions cause it"
         )
     if happens.axis != "time":
         return f"Repeat the runs at {happens.words} on another day, with some slightly below and above"
     return (
-        f"Repeat two runs, finely sampled from {happens.low:.3g} to {happens.high:.3g} s. In one, switch nothing then"
+        f"Repeat two runs, finely sampled from {happens.low:.3g} to {happens.high:.3g} s. In one of them, change no "
+        "input during that time"
     )
 
 
@@ -238,7 +239,7 @@ def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
             f"Record ten minutes {warm} from a cold start, and again while warm. Watch the winding's "
             f"temperature{_temperature_limit(within.hot)}"
         ),
-        "order": "Repeat the table in reverse order, one condition after every fifth run",
+        "order": "Repeat the table in reverse order, and repeat one reference condition after every fifth run",
     }
 
 

@@ -75,8 +75,8 @@ def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> st
     row_words = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
         return (
-            f"{row_words} are within {share:.0%} of the adhesion limit. They bound static friction from below, but "
-            "slip more than sliding explains"
+            f"{row_words} are within {share:.0%} of the adhesion limit. They give a lower bound for static friction, "
+            "but their slip is larger than the friction model predicts"
         )
     if what == "jumps":
         return f"{row_words}: the calibrated robot leaves the ground"
@@ -264,10 +264,11 @@ def residual_cluster(c: ResidualCluster) -> str:
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "feedforward_sign": (
-        "The velocity has the opposite sign of the voltage, which is changed here. Invert it in the robot's code."
+        "Velocity and voltage have opposite signs. This fit flips the velocity. Invert one of them in the robot's code."
     ),
     "feedforward_speed_sign": (
-        "Velocity and position have opposite signs. The velocity's is changed here: invert one in the robot's code."
+        "Velocity and position have opposite signs. This fit flips the velocity. Invert one of them in the robot's "
+        "code."
     ),
     "feedforward_unit": lambda ratio, near: (
         f"The velocity is {ratio:.4g} times the rate of the position: "

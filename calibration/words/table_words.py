@@ -140,7 +140,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "copied": copied_channel,
     "turned": (
         "{source}, {theirs}: its rms error is {off:.2g}, but {turned:.2g} with the opposite sign. To reverse it, "
-        ' set [columns] {column} = {{column = "{theirs}", factor = -1}}'
+        'set [columns] {column} = {{column = "{theirs}", factor = -1}}'
     ),
     "stiff_supply": (
         "{column} is {value:g} in every row, so the supply counts as stiff. If it is not measured, remove it"
@@ -181,8 +181,8 @@ SAID: dict[str, str | Callable[..., str]] = {
     ),
     "thinned_table": ("{source}: {kept} of {rows} rows are used and numbered anew. Change this with --rows"),
     "coarse_steps": lambda lasts, step: (
-        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms. Faster ripple than ten steps needs "
-        "shorter runs"
+        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms. To resolve ripple with a "
+        "shorter period than ten steps, use shorter runs"
     ),
     "stops_on_slope": (
         "run {runs}: the motors are not driven on a slope. The simulated robot creeps there at a few mm/s. "

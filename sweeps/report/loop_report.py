@@ -170,7 +170,8 @@ def _errors(found: DiscoveryResult) -> Table:
             change = proposal[c]["rms_percent"] - refit[c]["rms_percent"]
             rises = c in worse or (change >= NOTABLE and not kind)
             falls = change <= -NOTABLE and not rises
-            cells.append(Cell(text + " ↑" * rises + " ↓" * falls, "bad" * rises + "good" * falls))
+            mark, tone = (" ↑", "bad") if rises else (" ↓", "good") if falls else ("", "")
+            cells.append(Cell(text + mark, tone))
         rows.append((_unseen(kind) if kind else "seen by the fit", *cells, reached(refit)))
     rows += [
         (_unseen(kind), *["-"] * len(found.channels), "not predictable from the others")
@@ -254,7 +255,8 @@ def _sections(
     looked_for = Section("Effects that were tested", tuple(_looked_for(found)))
     if run_by_run:
         yield Section("Measured and simulated, run by run", tuple(run_by_run))
-    yield from [looked_for] * (not missing)
+    if not missing:
+        yield looked_for
     yield Section("Where the missing term acts" if missing else "What each equation lacks", tuple(missing_term))
     yield from fit_tables.clusters_section(found.residual_clusters)
     fits = {when: rms for when, rms in found.rms.items() if not (found.refit_alone and "after" in when)}
