@@ -1,8 +1,8 @@
 """Files that store finished chunks and stages, so that an interrupted command can continue.
 
-Each file is a pickle after its checksum. Reading runs no code from the file: a pickle may name only dataclasses and
-named tuples of `mmrjax` and `calibration`, effects that the user has loaded, and the functions in `REBUILDING`,
-`ARRAYS` and `FUNCTIONS`.
+Each file is a pickle after its checksum. Reading runs no code from the file. A pickle may name only dataclasses and
+named tuples of `mmrjax` and `calibration`, effects that the user has loaded, and a few functions. These functions are
+in `REBUILDING`, `ARRAYS` and `FUNCTIONS`.
 """
 
 from __future__ import annotations

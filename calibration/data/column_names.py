@@ -149,9 +149,9 @@ def match_column_names(
     Raises:
         BadData: a name occurs twice.
     """
-    every = replace(layout, channels=channels.EVERY)
+    full_layout = replace(layout, channels=channels.EVERY)
     spelled: dict[str, set[str]] = {}
-    for column in (every if inferred else layout).spellings():
+    for column in (full_layout if inferred else layout).spellings():
         spelled.setdefault(column.casefold(), set()).add(column)
     matched_names, notes = [], []
     for column in header:
@@ -165,7 +165,7 @@ def match_column_names(
     if repeated is not None:
         raise BadData(f"{name}: column {repeated} is present {matched_names.count(repeated)} times; expected once")
     if inferred or of_turns:
-        present = {m.column for m in every.meanings(name, matched_names) if m is not None}
+        present = {m.column for m in full_layout.meanings(name, matched_names) if m is not None}
         turns = of_turns and {*layout.sides, *VOLTS, *HEADING} & present
         more = channels.EVERY if inferred else channels.OF_TURNS if turns else ()
         read = (c for c in channels.EVERY if c in layout.channels or (c in more and c.column in present))

@@ -207,8 +207,10 @@ class Layout:
 
     def quantities(self) -> dict[str, Quantity]:
         """Quantity of each column, including conditions that do not act on the load."""
-        shown = [c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)]
-        rows = (*quantities.LABELS, *quantities.SET, *(q for c in shown for q in (c, c.deviation)))
+        present_channels = [
+            c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)
+        ]
+        rows = (*quantities.LABELS, *quantities.SET, *(q for c in present_channels for q in (c, c.deviation)))
         known_columns = {*self.known(), *ON_GROUND, *ON_SHAFT}
         return {q.column: q for q in rows if q.column in known_columns}
 
@@ -219,21 +221,21 @@ class Layout:
             BadData: two columns hold the same quantity.
         """
         by_name = self._by_name
-        mapped = {column: (mine, factor) for mine, column, factor in self.mapped if column in header}
+        mapped = {column: (own_name, factor) for own_name, column, factor in self.mapped if column in header}
         unread = {name for c in channels.EVERY for q in (c, c.deviation) for name in q.columns()} if mapped else set()
-        taken = {by_name[mine].column for mine, _ in mapped.values() if mine in by_name}
+        mapped_columns = {by_name[own_name].column for own_name, _ in mapped.values() if own_name in by_name}
         meanings: list[Column | None] = []
         for column in header:
             if column not in mapped:
                 meant = by_name.get(column)
-                meanings.append(None if meant is None or meant.column in taken else meant)
+                meanings.append(None if meant is None or meant.column in mapped_columns else meant)
                 continue
-            mine, factor = mapped[column]
-            meant = by_name.get(mine)
-            if meant is None and mine not in unread:
+            own_name, factor = mapped[column]
+            meant = by_name.get(own_name)
+            if meant is None and own_name not in unread:
                 raise BadData(
-                    f"{source}: the robot's file reads {mine} from column {column}; mmrjax has no column {mine} "
-                    f"(known: {', '.join(self.known())})"
+                    f"{source}: the robot's file reads {own_name} from column {column}; mmrjax has no column "
+                    f"{own_name} (known: {', '.join(self.known())})"
                 )
             meanings.append(None if meant is None else replace(meant, shown=column, factor=factor))
         first: dict[str, Column] = {}
@@ -274,7 +276,11 @@ class Layout:
             for s, unit in q.columns().items()
         }
         unit = quantities.unit_at_end(name, {unit for _, unit in spelled.values()})
-        pool = [s for s, (column, own) in spelled.items() if own == unit or (unit is None and s == column)]
+        pool = [
+            s
+            for s, (column, spelled_unit) in spelled.items()
+            if spelled_unit == unit or (unit is None and s == column)
+        ]
         close = difflib.get_close_matches(name.casefold(), [s.casefold() for s in pool], 1, ALIKE)
         if close:
             return next(s for s in pool if s.casefold() == close[0])
@@ -283,7 +289,7 @@ class Layout:
 
     def expected(self, column: str) -> str:
         """Name of the column, and its name in the source if the robot file states one."""
-        for mine, theirs, _ in self.mapped:
-            if mine == column or (mine in self._by_name and self._by_name[mine].column == column):
-                return f"{column} (in the robot's file: {theirs})"
+        for own_name, source_column, _ in self.mapped:
+            if own_name == column or (own_name in self._by_name and self._by_name[own_name].column == column):
+                return f"{column} (in the robot's file: {source_column})"
         return column

@@ -185,8 +185,8 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     """Paths of signals that may be columns, each with its line of a table `[columns]`: the time, then the others."""
     spelled = set(Layout(channels=channels.EVERY).spellings())
     row_signals = [s for s in signals if s.clock is None and not s.refused]
-    stated = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
-    clock = stated or next((s for s in row_signals if _is_rising_count(s)), None)
+    time_signal = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
+    clock = time_signal or next((s for s in row_signals if _is_rising_count(s)), None)
     other_signals = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
     elapsed = None
     if clock is not None:
@@ -196,7 +196,7 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
         line = f'time_{unit} = "{clock.path}"'
         if count is not None:
             elapsed = count * UNITS[unit]
-        if stated is None and count is not None:
+        if time_signal is None and count is not None:
             per_count = proposals.seconds_per_count(other_signals, count)
             question = f"compared with a position, it counts {1 / per_count:.3g} per second"
             if math.isnan(per_count):

@@ -48,13 +48,13 @@ def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Nam
         BadData: a battery feeds the motors, one side's voltage is missing, the table also states shares, or a voltage
             is higher than the supply's.
     """
-    stated = [c for c in VOLTS if c in columns]
-    if not stated:
+    voltage_columns = [c for c in VOLTS if c in columns]
+    if not voltage_columns:
         return ()
     if battery:
         raise BadData(
-            f"{name}: column {stated[0]} together with --battery, whose voltage falls; give {' and '.join(SIDES)} "
-            "instead"
+            f"{name}: column {voltage_columns[0]} together with --battery, whose voltage falls; give "
+            f"{' and '.join(SIDES)} instead"
         )
     check_commands_of_sides(name, columns, VOLTS, (*SIDES, *DUTY))
     volts = np.stack([columns.pop(c) for c in VOLTS])
@@ -79,16 +79,16 @@ def check_commands_of_sides(name: str, columns: Columns, pair: Iterable[str], wh
     Raises:
         BadData: one column of the pair is missing, or another gives the command too.
     """
-    stated = [c for c in pair if c in columns]
-    if extra := next((c for c in whole if stated and c in columns), None):
+    commanded = [c for c in pair if c in columns]
+    if extra := next((c for c in whole if commanded and c in columns), None):
         raise BadData(
-            f"{name}: column {extra} in addition to {stated[0]}, which already gives the command of both sides; keep "
-            "one"
+            f"{name}: column {extra} in addition to {commanded[0]}, which already gives the command of both sides; "
+            "keep one"
         )
-    if len(stated) == 1:
-        (other,) = {*pair} - {*stated}
+    if len(commanded) == 1:
+        (other,) = {*pair} - {*commanded}
         raise BadData(
-            f"{name}: column {other} is missing although {stated[0]} is present; give the command of both sides"
+            f"{name}: column {other} is missing although {commanded[0]} is present; give the command of both sides"
         )
 
 

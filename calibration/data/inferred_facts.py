@@ -42,15 +42,15 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, tuple[float, float, flo
         return {}
     configuration_index = runs.configurations(robot)
     total, payload = runs["total_mass_kg"], runs["payload_kg"]
-    own = total - payload
+    robot_mass = total - payload
     low, high = params.parameters_by_name(robot.configurations.members[0])["mass"].spec.bounds
     end = f"expected {low:g} to {high:g} kg without the payload"
     why = lambda row: f" with a payload of {payload[row]:g} kg; {end}"  # noqa: E731
-    check_rows(runs.source, runs.columns, [("total_mass_kg", (own < low) | (own > high), why)])
+    check_rows(runs.source, runs.columns, [("total_mass_kg", (robot_mass < low) | (robot_mass > high), why)])
     masses = {}
     for index in np.unique(configuration_index):
         rows = configuration_index == index
-        m, constant = own[rows], bool(np.ptp(total[rows]) <= MASS_ROUNDING)
+        m, constant = robot_mass[rows], bool(np.ptp(total[rows]) <= MASS_ROUNDING)
         median = round(float(np.median(m)), 6)
         masses[robot.configurations.names[index]] = (median, float(m.min()), float(m.max()), constant)
     return masses
@@ -191,10 +191,10 @@ def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> 
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
     """Robot with the instruments inferred from its table."""
-    stated, of_table = robot.rig.instruments, runs.layout.instruments
-    instruments = of_table if any(i.free for i in stated) else stated
-    named = {i.channel for i in instruments}
-    instruments = (*instruments, *(i for i in of_table if i.channel not in named))
-    if instruments == stated:
+    of_rig, of_table = robot.rig.instruments, runs.layout.instruments
+    instruments = of_table if any(i.free for i in of_rig) else of_rig
+    measured_channels = {i.channel for i in instruments}
+    instruments = (*instruments, *(i for i in of_table if i.channel not in measured_channels))
+    if instruments == of_rig:
         return robot
     return replace(robot, rig=replace(robot.rig, instruments=instruments))

@@ -282,7 +282,9 @@ def _fill_in_numbers(name: str, numbers: Mapping[str, float]) -> str:
 def merge_columns(first: Mapped, others: Mapped) -> Mapped:
     """Columns of two tables. `first` takes precedence if both state a column or read the same source column."""
     first = tuple(first)
-    used_names = {_name_without_unit(own_column) for own_column, _, _ in first} | {theirs for _, theirs, _ in first}
+    used_names = {_name_without_unit(own_column) for own_column, _, _ in first} | {
+        source_column for _, source_column, _ in first
+    }
     return (*first, *(c for c in others if _name_without_unit(c[0]) not in used_names and c[1] not in used_names))
 
 

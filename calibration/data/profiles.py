@@ -431,11 +431,11 @@ def _check_demands(
     Args:
         is_required: False if no segment follows the row.
     """
-    where = f"{cells.source} row {row + 1}"
+    place = f"{cells.source} row {row + 1}"
     if others:
         other = cells.columns[demands[0]][0] if demands and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
-            f"{where}, {cells.columns[others[0]][0]}: got {cells.text(others[0], row)} in addition to {other}; "
+            f"{place}, {cells.columns[others[0]][0]}: got {cells.text(others[0], row)} in addition to {other}; "
             "expected one demand per row"
         )
     for field in next((pair for pair in PAIRS if pair[0] in cells.columns), ()):
@@ -445,13 +445,13 @@ def _check_demands(
         return
     if mode not in cells.columns:
         raise BadData(
-            f"{where}, mode: got {mode}; expected a column with that demand, such as "
+            f"{place}, mode: got {mode}; expected a column with that demand, such as "
             f"{next(iter(QUANTITIES[mode].columns()))}"
         )
     if not demands and is_required:
         cells.refuse(mode, row, f"the demand of mode {mode}")
     if cells.linear and before in CONTROLLED and before != mode:
         raise BadData(
-            f"{where}: goes from a demanded {before} to a demanded {mode} although between_rows is linear; expected "
+            f"{place}: goes from a demanded {before} to a demanded {mode} although between_rows is linear; expected "
             "one kind of demand, or a braking or coasting row between"
         )

@@ -108,16 +108,16 @@ def propose_columns(
     spelled_stems = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
     known_units = {unit for units in columns.values() for unit in units.values()}
     known_units -= {"", "s", "ms", "us", "ns", "min", "h"}
-    stated = {signal.path: _stated_unit(signal, known_units) for signal in signals}
-    count = collections.Counter(stated[signal.path] for signal in signals)
+    stated_units = {signal.path: _stated_unit(signal, known_units) for signal in signals}
+    count = collections.Counter(stated_units[signal.path] for signal in signals)
     candidates = (
-        _candidate_of_signal(signal, stated[signal.path], count[stated[signal.path]] == 1, columns)
+        _candidate_of_signal(signal, stated_units[signal.path], count[stated_units[signal.path]] == 1, columns)
         for signal in signals
-        if signal.name not in spelled and stated[signal.path] in {None, *known_units}
+        if signal.name not in spelled and stated_units[signal.path] in {None, *known_units}
     )
     pool = [candidate for candidate in candidates if candidate is not None]
     groups: dict[str, list[ColumnCandidate]] = {}
-    for candidate in _currents_by_duty(_candidates_by_rate(pool, stated, columns, seconds)):
+    for candidate in _currents_by_duty(_candidates_by_rate(pool, stated_units, columns, seconds)):
         groups.setdefault(candidate.quantity, []).append(candidate)
     for quantity, group in groups.items():
         if quantity in spelled_stems:
@@ -227,13 +227,13 @@ def seconds_per_count(signals: Sequence[Signal], count: np.ndarray) -> float:
         count: counts of the clock, shape (rows,).
     """
     known_units = {unit for of_place, of_rate, _ in RATES for unit in (of_place, of_rate)}
-    stated = [
+    signals_with_units = [
         (signal, _stated_unit(signal, known_units))
         for signal in signals
         if not (signal.refused or signal.words) and signal.length == len(count)
     ]
     pairs = {(of_place, of_rate): seconds for of_place, of_rate, seconds in RATES}
-    for (place, of_place), (rate, of_rate) in itertools.permutations(stated, 2):
+    for (place, of_place), (rate, of_rate) in itertools.permutations(signals_with_units, 2):
         seconds = pairs.get((of_place or "", of_rate or ""))
         if seconds is not None:
             factor = _integral_factor(count, np.asarray(place.load(), float), np.asarray(rate.load(), float))

@@ -250,10 +250,10 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
         return ""
     heading = runs.heading(column)
     motionless = largest > needed and not any(c.zero_at_rest and runs.has(c.column) for c in runs.channels)
-    held = "Was the shaft held? Then add a column held with 1 in these rows. " * motionless
+    clamp_hint = "Was the shaft held? Then add a column held with 1 in these rows. " * motionless
     return (
         f"{runs.source}, {heading}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
-        f"slowly at {three_digits(needed)} A. {held}Is it in another unit (mA, mN·m)? Then state [columns] "
+        f"slowly at {three_digits(needed)} A. {clamp_hint}Is it in another unit (mA, mN·m)? Then state [columns] "
         f'{column} = {{column = "{heading}", factor = ...}}'
     )
 
@@ -464,19 +464,19 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
     reasons |= {name: why for name, (_, why) in rig_file.DEFAULTS.items()}
     of_loads = rig_file.FOLLOWS | {key: why for key, (_, why) in rig_file.VEHICLE.items()}
     of_loads["radius"] = "not stated: travel is the angle"
-    shown = (*(f"{name}." for name in robot.configurations), "motor.friction", "gearbox.")
+    prefixes = (*(f"{name}." for name in robot.configurations), "motor.friction", "gearbox.")
     if any(name.startswith(f"{BATTERY}.") for name in names_in_file):
-        shown += (f"{BATTERY}.",)
+        prefixes += (f"{BATTERY}.",)
     if rig_file.WHEELBASE in names_in_file:
-        shown += (rig_file.CENTRE,)
+        prefixes += (rig_file.CENTRE,)
     if not robot.rig.inherits:
-        shown += ("motor.inertia", *["motor.inductance"] * robot.rig.shows_voltage)
+        prefixes += ("motor.inertia", *["motor.inductance"] * robot.rig.shows_voltage)
     origins = []
     for p in params.walk_parameters(robot):
         head, _, key = p.name.partition(".")
         if p.name in names_in_file:
             why = "computed from mass and travel of the linear unit" if head in file.linear else "the file"
-        elif not p.name.startswith(shown):
+        elif not p.name.startswith(prefixes):
             continue
         elif robot.rig.inherits:
             why = "its base"

@@ -185,21 +185,21 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
     """
 
     def word(key: str, words: Sequence[str]) -> str:
-        stated = content.pop(key, words[0])
-        if key == "imposed" and isinstance(stated, str):
-            stated = SHORT.get(stated, stated)
-        return stated_word(stated, words, f"{where}, {key}")
+        value = content.pop(key, words[0])
+        if key == "imposed" and isinstance(value, str):
+            value = SHORT.get(value, value)
+        return stated_word(value, words, f"{where}, {key}")
 
     imposed, start, between = word("imposed", IMPOSED), word("start", STARTS), word("between_rows", BETWEEN)
     usual = [name for name in channels.USUAL if name != imposed and (travels or name != "speed")]
-    every, place = channels.channel_names(channels.EVERY), f"{where}, channels"
-    listed = f"a list of channels, at least one of {', '.join(every)}"
-    stated = stated_names(content.pop("channels", usual), place, listed)
-    for name in stated:
-        stated_word(name, every, place)
-        if stated.count(name) > 1:
+    all_channels, place = channels.channel_names(channels.EVERY), f"{where}, channels"
+    expected = f"a list of channels, at least one of {', '.join(all_channels)}"
+    stated_channels = stated_names(content.pop("channels", usual), place, expected)
+    for name in stated_channels:
+        stated_word(name, all_channels, place)
+        if stated_channels.count(name) > 1:
             raise BadConfiguration(f"{place}: {name} is repeated; expected each channel once")
-    names = tuple(name for name in every if name in stated)
+    names = tuple(name for name in all_channels if name in stated_channels)
     if idle := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
         raise BadConfiguration(
             f"{place}: {min(idle)} is imposed, so it cannot be a reading; remove it, or set imposed = "

@@ -133,10 +133,10 @@ def _contradictions_in_rows(name: str, columns: Columns, layout: Layout) -> Iter
         yield "duty", driven & np.isnan(duty), "; expected a number from -1 to 1"
         undriven = ~driven & (np.nan_to_num(duty) != 0)
         yield "duty", undriven, lambda row: f" in mode {modes[row]}; expected 0 or an empty cell"
-    held = columns.get("held", np.zeros(1))
-    yield "held", (held != 0) & (held != 1), "; expected 1 if a clamp holds the output, otherwise 0"
+    clamp = columns.get("held", np.zeros(1))
+    yield "held", (clamp != 0) & (clamp != 1), "; expected 1 if a clamp holds the output, otherwise 0"
     why = "; expected 0, since the torque at a clamp is a reading: rename its column to output_torque"
-    yield LOAD, (held == 1) & (columns.get(LOAD, 0.0) != 0), f" although held is 1{why}"
+    yield LOAD, (clamp == 1) & (columns.get(LOAD, 0.0) != 0), f" although held is 1{why}"
     contradictions.check_commands_of_sides(name, columns, layout.sides, ("duty", "mode"))
     if "total_mass_kg" in columns:
         payload = columns["payload_kg"]

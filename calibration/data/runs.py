@@ -158,7 +158,7 @@ def runs_of_arrays(
         notes += _drop_repeats(name, columns, layout)
     instruments = inferred_facts.infer_instruments(layout.instruments, columns)
     unsigned = contradictions.unsigned_current_channels(columns, layout) if measured else ()
-    unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in instruments})
+    unsigned = tuple(i for i in unsigned if i.channel not in {instrument.channel for instrument in instruments})
     layout = replace(layout, instruments=(*instruments, *unsigned))
     row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)
     if battery and layout.imposed == "voltage":

@@ -219,8 +219,8 @@ def settle_log(
         drift: largest change within a stretch, as a share of the mean.
 
     Raises:
-        BadData: time does not increase, a channel has a single value, there is no stretch, speeds or currents have no
-            sign, or speeds or rates of angles are in other units than their columns state.
+        BadData: time does not increase, a channel has a single value, or there is no stretch. Also if speeds or
+            currents have no sign, or speeds or rates of angles are in other units than their columns state.
     """
     result = _divide_log(runs, shortest, drift, {} if robot is None else acceleration_currents(robot))
     if not result.kept:

@@ -41,9 +41,9 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
         BadData: the load of a log is computed, the current is imposed, or there is no other channel.
     """
     columns, notes = dict(runs.columns), list(runs.notes)
-    shown = {c.column: c.name for c in runs.channels if runs.has(c.column)}
+    channels_by_column = {c.column: c.name for c in runs.channels if runs.has(c.column)}
     for torque, current in itertools.product((LOAD, TORQUE), CURRENTS):
-        if torque not in columns or not runs.has(current) or (torque == TORQUE and len(shown) < 2):
+        if torque not in columns or not runs.has(current) or (torque == TORQUE and len(channels_by_column) < 2):
             continue
         line = None if len(np.unique(runs[current])) < FEWEST else line_through(runs[current], runs[torque])
         if line is None or line[0] != 0.0:
@@ -55,10 +55,10 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
         if torque == TORQUE:
             columns.pop(torque)
             notes.append(f"{computed}. It is left out")
-        elif runs.sampled or shown.keys() <= {current, TORQUE} or current not in shown:
+        elif runs.sampled or channels_by_column.keys() <= {current, TORQUE} or current not in channels_by_column:
             raise BadData(f"{computed}; remove it and keep rows without a load, or give the torque set at the brake")
         else:
-            columns[torque] = _load_for_current(runs, robot, shown[current], columns.pop(current))
+            columns[torque] = _load_for_current(runs, robot, channels_by_column[current], columns.pop(current))
             notes.append(
                 f"{computed}. It is left out. The load follows from {current} and the robot's file, so this "
                 "current is no reading either"
@@ -204,8 +204,9 @@ def without_held(runs: Runs) -> Runs:
     if not (runs.sampled and runs.has(runs.layout.imposed_column)):
         return runs
     columns, notes, drive = dict(runs.columns), dict[str, str](), np.nan_to_num(applied_drive(runs))
-    shown = [c for c in runs.channels if runs.has(c.column) and c.rests_on != VOLTAGE]
-    changing = [c for c in shown if np.ptp(np.nan_to_num(runs[c.column])) > 0]  # others are frozen from the start
+    present_channels = [c for c in runs.channels if runs.has(c.column) and c.rests_on != VOLTAGE]
+    # Others are frozen from the start.
+    changing = [c for c in present_channels if np.ptp(np.nan_to_num(runs[c.column])) > 0]
     for rows, channel in itertools.product(runs.rows_by_run().values(), changing):
         column, readings = channel.column, runs[channel.column][rows]
         rest = 0.0 if channel.settled else MOVES * np.nanmax(np.abs(readings), initial=0.0)
@@ -214,16 +215,16 @@ def without_held(runs: Runs) -> Runs:
         is_long = lasts > HELD * len(rows)
         noisy = not is_long.all() and np.mean(lasts[~is_long] == 1) > NOISY
         for k in np.flatnonzero(is_long & (np.abs(readings[begins]) > rest)):
-            held = rows[begins[k] : begins[k] + lasts[k]]
-            if np.ptp(drive[held]) <= (SLIGHTLY if noisy else HELD) * np.ptp(drive):
+            stretch = rows[begins[k] : begins[k] + lasts[k]]
+            if np.ptp(drive[stretch]) <= (SLIGHTLY if noisy else HELD) * np.ptp(drive):
                 continue
             cure = "Empty these cells to use the other rows"
             if channel.settled:
                 columns[column] = columns[column].copy()
-                columns[column][held[1:]] = np.nan
+                columns[column][stretch[1:]] = np.nan
                 cure = "Such rows are left out"
             notes[column] = (
-                f"{runs.place(held[0], held[-1])}, {runs.heading(column)}: the same "
+                f"{runs.place(stretch[0], stretch[-1])}, {runs.heading(column)}: the same "
                 f"reading while {drive_heading(runs)} changes, like repeats. {cure}"
             )
     return replace(runs, columns=columns, notes=(*runs.notes, *notes.values()))

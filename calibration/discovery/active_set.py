@@ -201,8 +201,8 @@ class CandidateSpace:
         """
 
         def with_data(problem: Problem) -> Problem:
-            known = np.asarray(problem.data.sd)
-            new = known if sd is None else np.where(np.isfinite(sd) & (sd > 0), sd, known)
+            problem_sd = np.asarray(problem.data.sd)
+            new = problem_sd if sd is None else np.where(np.isfinite(sd) & (sd > 0), sd, problem_sd)
             return problem.with_data(sd=jnp.asarray(new), weight=jnp.asarray(weight))
 
         return dataclasses.replace(self, bare=with_data(self.bare), equipped=with_data(self.equipped))
@@ -222,14 +222,14 @@ class CandidateSpace:
         problem, coordinates = self.equipped, self.coordinates
         if self.bare.observe.long:
             placed = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
-            kept = np.flatnonzero(np.isin(self.library.names, list(placed)))
-            scales: Any = tuple(x[kept] for x in coordinates.scales)
+            effect_indices = np.flatnonzero(np.isin(self.library.names, list(placed)))
+            scales: Any = tuple(x[effect_indices] for x in coordinates.scales)
             coordinates = dataclasses.replace(
                 coordinates,
-                sd=coordinates.sd[kept],
+                sd=coordinates.sd[effect_indices],
                 scales=scales,
-                names=tuple(coordinates.names[k] for k in kept),
-                shapes=tuple(coordinates.shapes[k] for k in kept),
+                names=tuple(coordinates.names[k] for k in effect_indices),
+                shapes=tuple(coordinates.shapes[k] for k in effect_indices),
             )
             placed |= {e.name for e in self.bare.base.effects}
             robot = with_only(problem.base, placed)
@@ -321,13 +321,13 @@ def coordinate_groups(
         sd = float(coordinates.sd[coordinates.names.index(name)])
         rows.append((p + slot, f"effects.{name}.amplitude", amplitude, 0.0, sd, *amplitude.bounds, NORMAL))
         if shape is not None:
-            at, named = p + slots + slot, f"effects.{name}.{shape.name}"
+            index, full_name = p + slots + slot, f"effects.{name}.{shape.name}"
             value, spread, angle_sd, low, high = shape_scales(shape)
             if spread > 0:
                 ends = math.log(low) if low > 0 else -math.inf, math.log(high)
-                rows.append((at, named, shape.spec, math.log(value), spread, *ends, LOG))
+                rows.append((index, full_name, shape.spec, math.log(value), spread, *ends, LOG))
             else:
-                rows.append((at, named, shape.spec, value, angle_sd, -math.inf, math.inf, ANGLE))
+                rows.append((index, full_name, shape.spec, value, angle_sd, -math.inf, math.inf, ANGLE))
     if not rows:
         return [base], list(range(p))
     places, names, specs, *numbers, kinds = zip(*rows, strict=True)

@@ -38,12 +38,12 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, left, run, observe = given.runs, traced.left, traced.run, traced.screened.base.space.bare.observe
     space, base, best = traced.screened.base.space, traced.screened.base.candidate, traced.best
-    noise, shown, ends, predicted = traced.sds.noise, left, traced.ends, traced.predicted
+    noise, base_diagnosis, ends, predicted = traced.sds.noise, left, traced.ends, traced.predicted
     if run is not None:  # of a log: its simulation
         noise = noise if observe.reads else given.noise
         best = run.base if best is base else run.best
         space, base, predicted = run.space, run.base, {}
-        shown, ends = run.diagnosis(base, left), run.diagnosis(best, ends)
+        base_diagnosis, ends = run.diagnosis(base, left), run.diagnosis(best, ends)
     observe, included = space.bare.observe, space.included[: len(runs)]
     # The fit of the result: with the named effects, or with the curve if no name is given.
     curve, z, sd, cost = None, best.z, best.sd, best.cost
@@ -56,11 +56,11 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
     given.progress(fit_notes.progress_remark("errors"))
     kinds = blocks_room.predictable_blocks(runs, space.bare)
     before, after = (prediction.FittedProblem(*space.fit_of(c.active, c.z)) for c in (base, best))
-    known = [predicted.get(prediction.candidate_key(c)) for c in (base, best)]
+    predictions = [predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     if curve is not None:
-        after, known[1] = prediction.FittedProblem(curve.problem, curve.z, None), None
+        after, predictions[1] = prediction.FittedProblem(curve.problem, curve.z, None), None
     added = curve is not None or best is not base
-    row_readings = prediction.readings_of_rows(runs, noise.sd, kinds, before, after if added else None, *known)
+    row_readings = prediction.readings_of_rows(runs, noise.sd, kinds, before, after if added else None, *predictions)
     gains = _hold_out_gains(space, runs, predicted, traced.best.effects, row_readings)
     gain = gains[-1][1] if gains and added else None
     # What is written never predicts worse than the refit. A curve, which claims no cause, has to predict better.
@@ -68,7 +68,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
     if written and curve is not None:
         robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
     else:
-        fit, diagnosis = (best, ends) if written else (base, shown)
+        fit, diagnosis = (best, ends) if written else (base, base_diagnosis)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = active_set.posterior_of_fit(space, fit.active, fit.z, diagnosis.linear)
     given.progress(fit_notes.progress_remark("next"))
@@ -93,7 +93,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
-        detail=observe.detail(traced.screened.bases, included, shown, ends),
+        detail=observe.detail(traced.screened.bases, included, base_diagnosis, ends),
         readings_of_rows=row_readings,
         noise={
             name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
@@ -148,24 +148,24 @@ def _claims(
         curve: fitted curve if no effect is proposed.
     """
     settings, screened, left, kind = given.settings, traced.screened, traced.left, type(simulated.bare.observe)
-    space, decided, alike, where = screened.base.space, traced.best, traced.alike, traced.where
+    space, decided, alike, location = screened.base.space, traced.best, traced.alike, traced.where
     nameless, compared, p_value = traced.verdict in WITHOUT_NAME, traced.held_out, left.test.p_value
     effects: tuple[result.FoundEffect, ...] = ()
     concealed: tuple[hidden.HiddenEffect, ...] = ()
     if alike is not None:
-        named = dataclasses.replace(best, cost=decided.cost)
-        effects = findings.found_effects(space, screened.base.candidate, named, alike, left.test, settings)
+        candidate = dataclasses.replace(best, cost=decided.cost)
+        effects = findings.found_effects(space, screened.base.candidate, candidate, alike, left.test, settings)
         if not nameless and not simulated.bare.observe.long and not compared:
             compared = preference.compare_alternatives(simulated, given.runs, best, alike)
         if not nameless and traced.run is None:
             ask = kind.menu and not simulated.bare.observe.long
             concealed = hidden.find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
     unnamed = None
-    if nameless and traced.beside is not None and where is not None:
+    if nameless and traced.beside is not None and location is not None:
         if traced.run is None:
-            unnamed = findings.unnamed_discrepancy(traced.beside, where, p_value, len(given.runs))
+            unnamed = findings.unnamed_discrepancy(traced.beside, location, p_value, len(given.runs))
         else:
-            unnamed = findings.unnamed_discrepancy_of_log(traced.beside, where, p_value)
+            unnamed = findings.unnamed_discrepancy_of_log(traced.beside, location, p_value)
     cost = decided.cost if curve is None else curve.chi2[1] / 2
     ladder = () if traced.searched is None else (alike or traced.searched).ladder
     near, too_large = findings.listed_alternatives(space, decided, cost, ladder, settings)
@@ -179,7 +179,7 @@ def _claims(
         "outliers": tuple(int(given.numbers[k]) for k in outliers),
         "effects": effects,
         "unnamed": unnamed,
-        "remains": None if nameless or alike is None else where,
+        "remains": None if nameless or alike is None else location,
         "next_experiment": _next_experiment(space, traced, settings),
         "cannot_see": findings.invisible_effects(space, left.scores, scores, settings),
         "needs_histories": tuple(name for name, e in library if e.transient and not kind.shows(e)),

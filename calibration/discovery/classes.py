@@ -171,7 +171,7 @@ def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ..
     new = [active for active in rivals.values() if frozenset(active) - {""} not in fits]
     fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new], settings)
     fits |= {c.key: c for c in fitted}
-    members, stated, families = [], [], []
+    members, shift_lists, families = [], [], []
     for name, without in zip(best.effects, fewer, strict=True):
         same, gain = [name], 2 * (without.cost - best.cost)
         family = space.library[name].family()
@@ -190,8 +190,8 @@ def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ..
         ammeter = ammeter_families(space, remove_effect(space, best, name, fit), column, family, settings)
         families.append(tuple(dict.fromkeys((*families_of_members(space, same), *ammeter))))
         shifts = find_prior_shifts(space, without, SURE * gain, settings, left.linear if one else None)
-        stated.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
-    return Classes(tuple(members), tuple(stated), tuple(families), (*ladder, *fitted))
+        shift_lists.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
+    return Classes(tuple(members), tuple(shift_lists), tuple(families), (*ladder, *fitted))
 
 
 def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:

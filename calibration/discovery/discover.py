@@ -114,19 +114,19 @@ def _with_other_noises(
 
     Verdicts at other noises use the programs of the first one, so they run on other cores while the result is made.
     """
-    known = ready.noise
-    silent, factors = channels.channel_names(known.silent), FACTORS.get(known.word, ())
+    base_noise = ready.noise
+    silent, factors = channels.channel_names(base_noise.silent), FACTORS.get(base_noise.word, ())
     threads = compiling.Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
     sensitivity, outstanding = list[NoiseVerdict](), list[float]()
 
     def trace_with_noise(factor: float) -> verdict.LoopStages:
-        noise = known.scaled(dict.fromkeys(silent, factor))
+        noise = base_noise.scaled(dict.fromkeys(silent, factor))
         scaled = dataclasses.replace(ready, noise=noise, known=traced)
         return keep(f"noise {factor:g}", functools.partial(trace_verdict, scaled))
 
     try:
         if factors:
-            tell(fit_notes.progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
+            tell(fit_notes.progress_remark("factors", tuple(f"{f:g}" for f in factors), base_noise.word))
         verdicts = {f: threads.submit(trace_with_noise, f) for f in factors}
         result = assemble()
         if not all(one.done() for one in verdicts.values()):
@@ -198,18 +198,22 @@ def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.L
             if isinstance(results, verdict.LoopStages):
                 return results
             if not isinstance(results, dict):
-                each = results if len(stage.results) > 1 else (results,)
-                results = dict(zip(stage.results, each, strict=False))
+                values = results if len(stage.results) > 1 else (results,)
+                results = dict(zip(stage.results, values, strict=False))
             traced = dataclasses.replace(traced, **results)
     return traced
 
 
 def trace_known_readings(given: loop_input.LoopInput) -> verdict.LoopStages | None:
     """Stages of the known linear readings of a log with other noise. None for other tables."""
-    known = given.known
-    if known is None or (run := known.run) is None or not known.screened.base.space.bare.observe.reads:
+    shared_stages = given.known
+    if (
+        shared_stages is None
+        or (run := shared_stages.run) is None
+        or not shared_stages.screened.base.space.bare.observe.reads
+    ):
         return None
-    space = known.screened.base.space
+    space = shared_stages.screened.base.space
     equations = space.with_noise(given.noise.sd, space.weight)
     confirm = (
         functools.partial(log_stages.smallest_confirmed, run.space, given.settings) if given.known_room else None

@@ -49,14 +49,14 @@ def found_effects(
     null, excess = np.asarray(test.null.single), candidates.excess_misfit(space, base)
     effects = []
     classes_of_effects = zip(found.members, found.stated, found.families, others, strict=True)
-    for slot, (members, stated, families, without) in enumerate(classes_of_effects):
+    for slot, (members, shifts, families, without) in enumerate(classes_of_effects):
         effect, gain = space.library[members[0]], float(2 * (without.cost - best.cost))
         equation, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
         effects.append(
             result.FoundEffect(
                 name=effect.name,
                 members={name: _class_member(space, best, found, members[0], name) for name in members},
-                stated={s.name: _stated_value(space, best, s) for s in stated},
+                stated={s.name: _stated_value(space, best, s) for s in shifts},
                 families=families,
                 balance=effect.balance,
                 unit=BALANCES[effect.balance][0],
@@ -141,10 +141,10 @@ def unnamed_discrepancy_of_log(
     if where.variable in bases.ORDERS:
         return None
     curve, unit, formula = beside.linear_curve
-    at, value, sd = curve.drawn(curve.start, curve.covariance)
+    points, value, sd = curve.drawn(curve.start, curve.covariance)
     return result.UnnamedDiscrepancy(
-        **dataclasses.asdict(where), unit=unit, effect=curve.effect, p_value=p_value, score=curve.explained, at=at,
-        value=value, sd=sd, proposal=formula,
+        **dataclasses.asdict(where), unit=unit, effect=curve.effect, p_value=p_value, score=curve.explained,
+        at=points, value=value, sd=sd, proposal=formula,
     )  # fmt: skip
 
 
@@ -253,19 +253,19 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
     score_list = []
     for effect in space.library.effects:
         m = space.library.best_instance(effect.name, np.asarray(scores.single))
-        wanted, left, unit = float(scores.amplitude[m]), float(scores.left[m]), amplitude_unit(effect)
+        best_amplitude, sigmas, unit = float(scores.amplitude[m]), float(scores.left[m]), amplitude_unit(effect)
         spec = linearization.amplitude_of(effect).spec
         low = max(-settings.plausible, spec.bounds[0] / unit)
-        amplitude = min(max(wanted, low), settings.plausible)
-        explained = float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
+        amplitude = min(max(best_amplitude, low), settings.plausible)
+        explained = float(scores.single[m] ** 2 - ((best_amplitude - amplitude) * sigmas) ** 2)
         score_list.append(
             result.EffectScore(
                 name=effect.name,
                 balance=effect.balance,
                 score=max(explained, 0.0),
                 amplitude=amplitude * unit,
-                sigmas_per_prior_sd=left,
-                sd=unit / max(left, 1e-300),
+                sigmas_per_prior_sd=sigmas,
+                sd=unit / max(sigmas, 1e-300),
                 family=effect.family(),
                 unit=spec.unit,
                 # as in `candidates.supplying_effects`

@@ -92,9 +92,9 @@ def hold_out_gain_of_curve(beside: BaseCurve, runs: Runs, predicted: Predicted) 
 
 def _where_seen(beside: BaseCurve, score: HeldOutScore, kinds: Mapping[str, Columns]) -> HeldOutScore:
     """The hold-out score without rows outside the range of the curve's variable in their fit."""
-    seen = {kind: _within_seen_range(beside, list(by_name.values())) for kind, by_name in kinds.items()}
+    rows_in_range = {kind: _within_seen_range(beside, list(by_name.values())) for kind, by_name in kinds.items()}
     return dataclasses.replace(
-        score, by_kind={kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
+        score, by_kind={kind: np.where(rows_in_range[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
     )
 
 
@@ -122,8 +122,8 @@ def linear_gain_of_curve(beside: BaseCurve, runs: Runs, _: Predicted) -> Gain:
     def residuals(out: np.ndarray, with_curve: bool) -> np.ndarray:
         included = space.included & ~np.append(out, np.zeros(len(space.included) - rows, bool))
         a, e = augment_with_columns(linear, curve_columns(included)) if with_curve else (jacobian, residual)
-        kept = np.append(kept_readings(space, out, linear.readings), np.ones(len(e) - linear.readings, bool))
-        z = np.linalg.lstsq(a[kept], -e[kept], rcond=None)[0]
+        kept_rows = np.append(kept_readings(space, out, linear.readings), np.ones(len(e) - linear.readings, bool))
+        z = np.linalg.lstsq(a[kept_rows], -e[kept_rows], rcond=None)[0]
         return (e + a @ z)[: linear.readings].reshape(len(space.included), -1)[:rows]
 
     def score(with_curve: bool) -> HeldOutScore:

@@ -209,8 +209,8 @@ def _chosen_fit(traced: LoopStages) -> Candidate:
     base, searched, mechanism = traced.screened.base.candidate, traced.searched, traced.mechanism
     if searched is None or traced.best is not base:
         return traced.best
-    named = frozenset(() if mechanism is None else mechanism.effects)
-    return min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+    effect_names = frozenset(() if mechanism is None else mechanism.effects)
+    return min(searched.ladder, key=lambda c: (c.key != effect_names, not c.plausible, c.cost))
 
 
 def delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
@@ -265,8 +265,8 @@ def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) ->
     if searched is None or beside is None:
         return None
     given.progress(progress_remark("confirm"))
-    chosen, base = _chosen_fit(traced), delayed_by_rows(given, screened.base.candidate)
-    best = base if chosen is screened.base.candidate else delayed_by_rows(given, chosen)
+    reading_fit, base = _chosen_fit(traced), delayed_by_rows(given, screened.base.candidate)
+    best = base if reading_fit is screened.base.candidate else delayed_by_rows(given, reading_fit)
     run = simulate_models(given.space.with_room(searched.room), base, best, given.settings, disturbed=True)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))

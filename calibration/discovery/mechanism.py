@@ -115,8 +115,8 @@ def _with_ammeter_families(beside: BaseCurve, mechanism: Mechanism) -> Mechanism
     """The mechanism with ammeter errors that explain the data as well, see `ammeter_families`."""
     space, linear = beside.space, beside.left.linear
     if mechanism.effects:
-        shown = [space.library.names[k] in mechanism.effects for k in space.library.of]
-        columns = np.asarray(linear.signatures)[:, shown]
+        members = [space.library.names[k] in mechanism.effects for k in space.library.of]
+        columns = np.asarray(linear.signatures)[:, members]
     else:
         columns = location_columns(linear, beside.bases, beside.where)
     also = ammeter_families(space, Projection.of(linear), columns, mechanism.families[0], beside.settings)
@@ -191,9 +191,9 @@ def _curves_without_blocks(beside: BaseCurve, blocks: Sequence[np.ndarray]) -> t
     columns, fit = [family_columns(linear, beside.bases, k) for k in smooth], Projection.of(linear)
     explained = []
     for out in (np.zeros(len(space.included), bool), *blocks):
-        kept = kept_readings(space, out, linear.readings)
-        without_block = fit.only(kept)
-        explained.append([without_block.explained(c[kept]) for c in columns])
+        kept_rows = kept_readings(space, out, linear.readings)
+        without_block = fit.only(kept_rows)
+        explained.append([without_block.explained(c[kept_rows]) for c in columns])
     return families, np.array(explained)
 
 

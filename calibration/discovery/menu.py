@@ -245,8 +245,8 @@ class _Instrument:
     signals: Names
 
     def __call__(self, robot: Robot, at: Array) -> Array:
-        shown = [Signals(**dict.fromkeys(self.signals, x)) for (x,) in at]
-        return jnp.stack([jnp.asarray(balances.sensor(robot, s)[self.channel]) for s in shown])
+        signals = [Signals(**dict.fromkeys(self.signals, x)) for (x,) in at]
+        return jnp.stack([jnp.asarray(balances.sensor(robot, s)[self.channel]) for s in signals])
 
 
 def calibration_acts(reach: Reach) -> tuple[CalibrationAct, ...]:
@@ -396,7 +396,10 @@ def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
     """
     on_load = reach.imposed == "voltage" and reach.has_ground
     runs_of = _travel_runs if on_load else _shaft_runs
-    runs = [*(_motor_runs(reach) if on_load else ()), *(run for used in reach.used for run in runs_of(reach, used))]
+    runs = [
+        *(_motor_runs(reach) if on_load else ()),
+        *(run for conditions in reach.used for run in runs_of(reach, conditions)),
+    ]
     return (*calibration_acts(reach), *(r for r in runs if r.channels))
 
 

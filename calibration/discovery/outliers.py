@@ -230,9 +230,9 @@ def _common_property(found: Screening, runs: Runs, settings: Settings) -> Outlie
     """Property that the outliers share."""
     rows, included = np.arange(len(runs)), found.base.space.included
     axes = {a: runs[c] for a, c in (("time", "time_s"), ("order", "order")) if runs.has(c)}
-    turned = found.diagnosed[0].turned()
-    if turned is not None:
-        axes["angle of the driving shaft"] = turned[rows] % (2 * np.pi)
+    angle = found.diagnosed[0].turned()
+    if angle is not None:
+        axes["angle of the driving shaft"] = angle[rows] % (2 * np.pi)
     levels = {c: runs[c] for c in LEVELS if runs.has(c)}
     outliers = np.isin(rows, found.outliers)
     return find_cluster(outliers, included[rows], axes, levels, settings.outlier_error, settings.seed)

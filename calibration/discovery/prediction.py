@@ -272,8 +272,9 @@ def readings_of_rows(
     first = last = before.held_out(kinds) if known_before is None else known_before
     if after is not None:
         last = after.held_out(kinds) if known_after is None else known_after
-    stated, fitted = fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))), fitted_reading(before)
+    stated_reading = fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z)))
+    fitted = fitted_reading(before)
     return ReadingsOfRows(
-        runs.measured(), sd[: len(runs)], stated, fitted, fitted if after is None else fitted_reading(after),
+        runs.measured(), sd[: len(runs)], stated_reading, fitted, fitted if after is None else fitted_reading(after),
         {kind: (first[kind], last[kind]) for kind in kinds}, {kind: tuple(names) for kind, names in kinds.items()},
     )  # fmt: skip

@@ -63,9 +63,9 @@ class Projection:
 
     def roots(self, columns: np.ndarray, rows: np.ndarray | slice | None = None) -> np.ndarray:
         """Square root of the score of each column [σ]. 0 for columns that the free parameters can imitate."""
-        left, scores = self.norms(columns, rows)
-        is_visible = left > ABSORBED**2 * np.sum(columns**2, 0)
-        return np.where(is_visible, np.abs(scores) / np.sqrt(np.maximum(left, 1e-12)), 0.0)
+        norms, scores = self.norms(columns, rows)
+        is_visible = norms > ABSORBED**2 * np.sum(columns**2, 0)
+        return np.where(is_visible, np.abs(scores) / np.sqrt(np.maximum(norms, 1e-12)), 0.0)
 
     def only(self, kept: np.ndarray) -> Projection:
         """Projection of the same fit with some of the readings. Residuals of priors remain.

@@ -182,8 +182,8 @@ def _extend_set(
             pair = space.library.names[i], space.library.names[j]
             if not {fill_slots(pair, settings), fill_slots(pair[::-1], settings)} & sources.keys():
                 sources[fill_slots(pair, settings)] = base, left
-    wanted = [(active, fit, ranking.scores) for active, (fit, ranking) in sources.items()]
-    return fit_in_addition(space, wanted, settings)
+    extensions = [(active, fit, ranking.scores) for active, (fit, ranking) in sources.items()]
+    return fit_in_addition(space, extensions, settings)
 
 
 def _best_plausible(candidates: Sequence[Candidate]) -> Candidate | None:

@@ -271,10 +271,10 @@ def judge_each_name(
         curves = _strongest_curves(after, bases, equation)
         fit, columns = _with_curves(linear, bases, curves), space.library.columns(effect, linear)
         root = float(fit.roots(columns).max())
-        judged, at = fit, linear
+        judged, tangent = fit, linear
         if root**2 < PROMISED * 2 * (without.cost - best.cost):
-            at = after.linear
-            judged = remove_effect(space, best, effect, _with_curves(at, bases, curves))
+            tangent = after.linear
+            judged = remove_effect(space, best, effect, _with_curves(tangent, bases, curves))
         row, root_without, changed, root_changed = None, math.inf, "", 0.0
         if over_time:
             row, changed, root_changed = changed_run(space, linear, bases, fit)
@@ -293,7 +293,9 @@ def judge_each_name(
                 evidence,
                 row,
                 root_without,
-                _recurrence(space, families, judged, space.library.columns(effect, at), at, blocks, settings),
+                _recurrence(
+                    space, families, judged, space.library.columns(effect, tangent), tangent, blocks, settings
+                ),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 equation in lacks,
                 *_largest_variation(space, full_fit, effect, beside_all, settings.shares["single"]),
@@ -431,11 +433,11 @@ def _recurrence(
     akin = np.array([library[name].family() in families for name in library.names])[library.of]
     best_score = fit.norms(columns)[0].max()
     for out in blocks:
-        kept = kept_readings(space, out, len(signatures))
-        without = fit.only(kept)
-        if without.norms(columns[kept])[0].max() < 0.5 * best_score:
+        kept_rows = kept_readings(space, out, len(signatures))
+        without = fit.only(kept_rows)
+        if without.norms(columns[kept_rows])[0].max() < 0.5 * best_score:
             continue
-        roots = without.roots(signatures[kept])
+        roots = without.roots(signatures[kept_rows])
         most = np.max(roots) ** 2
         chosen_effects.append(np.max(roots[akin]) ** 2 >= most - settings.tolerance(most))
     return float(np.mean(chosen_effects)) if chosen_effects else 1.0
@@ -448,8 +450,8 @@ def _most_influential_row(space: CandidateSpace, fit: Projection, columns: np.nd
     least: tuple[int | None, float] = None, math.inf
     rows = np.flatnonzero(space.included)
     for row in rows if len(rows) > 2 else ():
-        kept = kept_readings(space, np.arange(len(space.included)) == row, len(columns))
-        root = float(fit.only(kept).roots(columns[kept]).max())
+        kept_rows = kept_readings(space, np.arange(len(space.included)) == row, len(columns))
+        root = float(fit.only(kept_rows).roots(columns[kept_rows]).max())
         least = (int(row) + 1, root) if root < least[1] else least
     return least
 

@@ -211,15 +211,15 @@ def curve_families(columns: Columns, weight: np.ndarray, ways: Ways, scope: Curv
         ways: direction of travel of each point, shape (rows,).
         scope: balances, conditions and channels.
     """
-    over: dict[str, str] = {}  # a variable, and the one that takes its place
+    substitutes: dict[str, str] = {}  # a variable, and the one that takes its place
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
             continue
         drift = variable in AXES and order_collinearity(columns, weight, scope.axes, column) > COLLINEAR[variable]
-        if drift and not over:
+        if drift and not substitutes:
             continue
         # A skipped variable is replaced by another, so that tables of one size share compiled programs.
-        over[variable] = next(iter(over)) if drift else variable
+        substitutes[variable] = next(iter(substitutes)) if drift else variable
 
     def curve(place: str, variable: str) -> np.ndarray:
         x, way = in_travel_frame(
@@ -231,9 +231,9 @@ def curve_families(columns: Columns, weight: np.ndarray, ways: Ways, scope: Curv
             * np.exp(-0.35 * np.arange(TERMS))
         )
 
-    names = [(balance, variable) for variable in over.values() for balance in scope.balances]
-    channel_variables = [(c, v) for c in scope.channels for v in over if v in AXES or v == READ_BY.get(c)]
-    new = [n for n in channel_variables if over[n[1]] == n[1]]
+    names = [(balance, variable) for variable in substitutes.values() for balance in scope.balances]
+    channel_variables = [(c, v) for c in scope.channels for v in substitutes if v in AXES or v == READ_BY.get(c)]
+    new = [n for n in channel_variables if substitutes[n[1]] == n[1]]
     # As above: a skipped curve is replaced by another of its channel, or else by the first.
     read = (
         [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in channel_variables] if new else []

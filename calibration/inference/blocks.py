@@ -155,8 +155,8 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
 def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
     """Kinds with at least one block that the other rows cannot predict."""
     predictable = predictable_blocks(runs, problem)
-    every = distinct_held_out_blocks(runs, problem.observe.blocks)
-    return tuple(kind for kind, blocks in every.items() if len(predictable.get(kind, {})) < len(blocks))
+    blocks_by_kind = distinct_held_out_blocks(runs, problem.observe.blocks)
+    return tuple(kind for kind, blocks in blocks_by_kind.items() if len(predictable.get(kind, {})) < len(blocks))
 
 
 def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:
@@ -271,9 +271,9 @@ def predict_unseen(
     steps = []
     promised = -np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
     for mask in _padded_masks(problem, masks):
-        kept = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
-        j = jacobian[kept]
-        steps.append(-np.linalg.solve(j.T @ j, j.T @ residual[kept]) - promised)
+        kept_rows = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
+        j = jacobian[kept_rows]
+        steps.append(-np.linalg.solve(j.T @ j, j.T @ residual[kept_rows]) - promised)
     readings, statuses = [reading + per_unit @ step for step in steps], [np.asarray(observation.status)] * len(masks)
     return _predictions(problem, masks, readings, statuses, z + np.stack(steps), np.ones(len(masks), bool))
 

@@ -255,7 +255,7 @@ def _search(
     Raises:
         BadConfiguration: a number of generations without a population, or the data do not support such a search.
     """
-    runs, base, known = setting.runs, setting.base, setting.ready.noise
+    runs, base, noise = setting.runs, setting.base, setting.ready.noise
     if size is None:
         size = POPULATION if fidelities.unread_parameters("steady", setting.ready.names, runs.turns) else 0
     if generations is not None and not size:
@@ -268,24 +268,24 @@ def _search(
         raise BadConfiguration(f"--population: got {size}; expected 0 or at least {LEAST} members")
     rng, all_members = np.random.default_rng(seed), None
     if runs.log is not None:
-        sd = np.broadcast_to(np.median(known.sd, 0), runs.log.measured().shape)
+        sd = np.broadcast_to(np.median(noise.sd, 0), runs.log.measured().shape)
         all_members = observers.pose_problem(runs.log, base, posed.coordinates, sd)
     points = posed.observe.starts(posed, rng, starts, all_members)
     if not posed.observe.long:
-        return multistart.search_from_starts(posed, known, points), None
+        return multistart.search_from_starts(posed, noise, points), None
     if not posed.observe.starts_from_steady:
-        shares = multistart.initial_noise_shares(known)
-        return multistart.search_one_by_one(posed, known, points, shares, tell), None
+        shares = multistart.initial_noise_shares(noise)
+        return multistart.search_one_by_one(posed, noise, points, shares, tell), None
     tell(progress_remark("steady"))
     draws = rng.standard_normal((fidelities.fidelity_facts("steady").starts, len(posed.coordinates)))
     draws[0] = 0.0
-    steady = observers.pose_problem(runs, base, posed.coordinates, known.sd)
-    easy = multistart.search_from_starts(steady, known, draws)
+    steady = observers.pose_problem(runs, base, posed.coordinates, noise.sd)
+    easy = multistart.search_from_starts(steady, noise, draws)
     points[0] = beside = np.asarray(easy.best.z)
     points[1:] = multistart.starts_from_posterior(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
     if not size:
-        return multistart.search_one_by_one(posed, known, points, easy.shares, tell), beside
+        return multistart.search_one_by_one(posed, noise, points, easy.shares, tell), beside
     # The first generation has the posterior of `steady`, but the prior for friction of contacts, which has another
     # meaning there.
     covariance = identifiability.analyse_identifiability(easy.problem, jnp.asarray(beside)).covariance.copy()
@@ -293,7 +293,7 @@ def _search(
     covariance[friction] = covariance[:, friction] = 0.0
     covariance[friction, friction] = 1.0
     everyone = population.run_evolution(
-        posed, population.member_objective(posed, known), beside, covariance, size=size,
+        posed, population.member_objective(posed, noise), beside, covariance, size=size,
         generations=generations or GENERATIONS, seed=seed, beside=points, tell=tell, keep=keep,
     )  # fmt: skip
     best_member = int(everyone.order[0])
@@ -303,8 +303,8 @@ def _search(
             f"--population: none of {len(everyone.z)} members runs in every row (ended in: {endings or 'none'}); "
             "begin from another robot, or free fewer parameters"
         )
-    shares = population.most_probable_noise(posed, known, np.asarray(everyone.seen.reading[best_member]))
-    posed = multistart.with_noise_shares(posed, known, shares)
+    shares = population.most_probable_noise(posed, noise, np.asarray(everyone.seen.reading[best_member]))
+    posed = multistart.with_noise_shares(posed, noise, shares)
     tell(progress_remark("derivatives"))
     identifiability_there = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
     unreliable = population.unreliable_derivatives(
@@ -314,7 +314,7 @@ def _search(
     slope, left = population.local_regression(posed, everyone, best_member) if names else (None, np.nan)
     edge = population.parameters_at_edge(posed.coordinates, everyone.z[best_member])
     searched = population.PopulationSearch(everyone, best_member, names, slope, left, edge)
-    return multistart.optimum_of_population(posed, known, shares, searched, tell), beside
+    return multistart.optimum_of_population(posed, noise, shares, searched, tell), beside
 
 
 def _calibration_result(

@@ -52,7 +52,7 @@ def parameter_estimates(
     coordinates = posed.coordinates
     point, sd = np.asarray(z), np.asarray(about.sd)
     value, slope = coordinates.value(point), np.asarray(coordinates.slope(point))
-    stated = coordinates.stated
+    stated_values = coordinates.stated
     linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
     wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
     steady: list[result.SteadyEstimate | None] = [None] * len(point)
@@ -80,7 +80,7 @@ def parameter_estimates(
             meaning=fields[name].spec.meaning,
             prior=result.PriorSummary(
                 "log-normal" if coordinates.scale[k] else "normal",
-                float(stated[k]),
+                float(stated_values[k]),
                 _float_pair(wide[k]),
                 sources.get(name, fields[name].spec.source),
             ),

@@ -200,10 +200,10 @@ class OneSidedLevenbergMarquardt(eqx.Module):
                 auxiliary output.
         """
         linearised = SolverLinearisation(residual, jacobian, self.first, self.last)
-        moved, first = state.ahead - y, state.steps == 0
+        last_step, first = state.ahead - y, state.steps == 0
         before = dataclasses.replace(state.found, jacobian=state.slope)
         # A mixed step whose prediction is a rise counts as one of no change.
-        predicted = half_squares(before.residual + before.jacobian @ moved, before.one_sided) - before.objective
+        predicted = half_squares(before.residual + before.jacobian @ last_step, before.one_sided) - before.objective
         predicted, change = jnp.minimum(predicted, 0.0), linearised.objective - before.objective
         accepted = first | (change <= LITTLE * predicted)
         good = ~first & (change < NEARLY_ALL * predicted) & (predicted < 0)
@@ -211,15 +211,15 @@ class OneSidedLevenbergMarquardt(eqx.Module):
         alike = jnp.all(linearised.positive == before.positive)
         accepted &= first | alike | ~state.mixed
         region = jnp.where(state.mixed & ~accepted, state.region, region)
-        has_converged = self._is_small(state.ahead, moved, linearised, before) & accepted
+        has_converged = self._is_small(state.ahead, last_step, linearised, before) & accepted
 
         corrected = state.slope
         if self.rough:
             least = jnp.finfo(y.dtype).tiny
-            projection, length = corrected @ moved, jnp.maximum(moved @ moved, least)
+            projection, length = corrected @ last_step, jnp.maximum(last_step @ last_step, least)
             missed = linearised.residual - before.residual - projection
             near = (state.steps > 0) & (linearised.objective < TELLING * before.objective)
-            corrected = jnp.where(near, corrected + jnp.outer(missed, moved) / length, corrected)
+            corrected = jnp.where(near, corrected + jnp.outer(missed, last_step) / length, corrected)
             half = jnp.minimum(region, length / jnp.maximum(projection @ projection, least))
             region = jnp.where(accepted | state.mixed, region, half)
         slope = jnp.where(accepted, linearised.jacobian, corrected)
@@ -228,7 +228,7 @@ class OneSidedLevenbergMarquardt(eqx.Module):
         damping = jnp.where(region > tiny.eps, 1 / jnp.maximum(region, tiny.eps), tiny.max)
         stride = one_sided_step(best.residual, slope, best.one_sided, damping)
         mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
-        next_y = y + jnp.where(mixed, mixed_step(stride, moved, stride - state.stride), stride)
+        next_y = y + jnp.where(mixed, mixed_step(stride, last_step, stride - state.stride), stride)
         rejected = jnp.where(accepted, 0, state.rejected + 1)
         is_over = has_converged | (rejected >= PATIENCE)
         return y, SearchState(best, slope, aux, stride, next_y, mixed, region, state.steps + 1, rejected, is_over)

@@ -551,15 +551,15 @@ def search_rollouts(
         ahead[fresh], trail[:, fresh] = starts[assigned.holds[fresh]], np.nan
         evaluated = evaluate(ahead[going], assigned.holds[going])
         for j, k in enumerate(going):  # one at a time, so that one program serves any number of searches
-            found = jax.tree.map(lambda x: x[j], evaluated)  # noqa: B023
+            evaluation = jax.tree.map(lambda x: x[j], evaluated)  # noqa: B023
             if k in fresh:
-                begun = ahead[k], solver.begin(ahead[k], found[0].size, found[2])
-                searches[k] = jax.device_get(begun), None
-            searches[k] = jax.device_get(_step_search(searches[k][0], found, data))
+                first_progress = ahead[k], solver.begin(ahead[k], evaluation[0].size, evaluation[2])
+                searches[k] = jax.device_get(first_progress), None
+            searches[k] = jax.device_get(_step_search(searches[k][0], evaluation, data))
         results = [(s.over, s.steps, s.ahead, s.aux, end) for (_, s), end in searches]
-        over, steps, ahead, observation, ends = jax.tree.map(lambda *x: np.stack(x), *results)
+        finished, steps, ahead, observation, ends = jax.tree.map(lambda *x: np.stack(x), *results)
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
-        is_over = over | (steps >= max_steps) | (ends.decrement < small)
+        is_over = finished | (steps >= max_steps) | (ends.decrement < small)
         is_over = is_over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
         cost[assigned.holds[going]] = ends.cost[going]
         if within < np.inf:

@@ -326,7 +326,7 @@ class PopulationSearch:
         return {
             "members": len(self.found.z),
             **entries_of(self, "settled=found.settled", "generations=found.generations", "outcomes=found.outcomes"),
-            "at_edge": {name: describe(at) for name, at in self.edge.items()},
+            "at_edge": {name: describe(position) for name, position in self.edge.items()},
             **entries_of(self, "derivatives_apart=apart", "regression_rms_sd=left"),
         }
 

@@ -118,8 +118,8 @@ def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualClust
     columns = _columns_to_test(residuals)
     if not columns:
         return ()
-    every = {k: _tests_of_channel(residuals, k, columns) for k in range(fit.counts.shape[1])}
-    channel_tests = {k: tests for k, tests in every.items() if tests is not None}
+    tests_by_channel = {k: _tests_of_channel(residuals, k, columns) for k in range(fit.counts.shape[1])}
+    channel_tests = {k: tests for k, tests in tests_by_channel.items() if tests is not None}
     count = sum(len(tested.tests) for tested in channel_tests.values())
     significant = {
         k: [(count * float(p[0]), test) for test, p in tested.p_values(tested.left[:, None]) if count * p[0] < LEVEL]

@@ -374,12 +374,12 @@ def memory_by_point(
         def after(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
             since, angle, signals = row
             speed, slope = value_and_slope(lambda m: linearization.memory_rates(robot, scored, signals, m), memory)
-            begun = linearization.initial_memory(robot, scored, angle)
-            memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun)
+            start_memory = linearization.initial_memory(robot, scored, angle)
+            memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), start_memory)
             return memory, memory
 
-        begun = linearization.initial_memory(robot, scored, rows.angle[0])
-        return jax.lax.scan(after, begun, (rows.since, rows.angle, signals))[1]
+        start_memory = linearization.initial_memory(robot, scored, rows.angle[0])
+        return jax.lax.scan(after, start_memory, (rows.since, rows.angle, signals))[1]
 
     return [zero if e.effect.memory_size is None else of_effect(e) for e, zero in zip(effects, nothing, strict=True)]
 

@@ -139,16 +139,16 @@ def morris_screening(
                 scores[:, i] = Z95 * (2 * unit[:, j] - 1)
 
         def analyse(values: np.ndarray) -> tuple[Any, float]:
-            found = sampled_indices.elementary_effects(unit, values)
-            if found is None:
+            statistics = sampled_indices.elementary_effects(unit, values)
+            if statistics is None:
                 return None, 1.0
-            effects, lost = found
+            effects, omitted = statistics
             widened = {}
             for key, estimate in effects.items():
-                every = np.zeros((3, len(study.inputs)))
-                every[:, input_set] = estimate
-                widened[key] = IntervalEstimate(*every)
-            return widened, lost / count
+                padded = np.zeros((3, len(study.inputs)))
+                padded[:, input_set] = estimate
+                widened[key] = IntervalEstimate(*padded)
+            return widened, omitted / count
 
         return scores, analyse
 
@@ -271,7 +271,9 @@ def _local_study(row: Quantity, study: Study, found: LocalDerivatives) -> Output
 
 
 def _no_point_message(statuses: dict[str, dict[str, int]]) -> str:
-    status_words = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
+    status_words = "; ".join(
+        f"{s}: " + ", ".join(f"{n} {w}" for w, n in counts.items()) for s, counts in statuses.items()
+    )
     return (
         f"too many robots do not travel at any operating point ({status_words}). Choose smaller --slopes, "
         "another --voltages, or calibrate the adhesion"

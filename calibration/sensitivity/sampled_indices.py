@@ -213,10 +213,10 @@ def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
 
 
 def elementary_effects(points: np.ndarray, values: np.ndarray) -> tuple[dict[str, IntervalEstimate], int] | None:
-    """Statistics of the elementary effects of each input on one output [unit of the output per range of the input],
-    and the number of trajectories that are omitted, because the model has no value at one of their points.
+    """Statistics of the elementary effects of each input on one output, and the number of omitted trajectories.
 
-    The statistics are μ* with its interval, μ and σ, each of shape (inputs,).
+    The statistics are μ* with its interval, μ and σ, each of shape (inputs,) [unit of the output per range of the
+    input]. A trajectory is omitted if the model has no value at one of its points.
 
     Args:
         points: points from `morris_design`.

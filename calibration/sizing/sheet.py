@@ -250,14 +250,14 @@ class _QuantityOfRobot:
 
     def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values in the unit of the name, outcomes, and margins (-inf without a value), shape (rows, points)."""
-        r, at, parts = self.requirement, self.at, []
+        r, point, parts = self.requirement, self.at, []
         robot, rated = _robot_without_ratings(self.robot), ratings(self.robot)
         for first in range(0, len(rows), ROWS):
             chunk_rows = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
-            found = jax.device_get(
-                _quantity_at_points(robot, rated, self.names, jnp.asarray(chunk_rows), at, _computed_name(r))
+            chunk_results = jax.device_get(
+                _quantity_at_points(robot, rated, self.names, jnp.asarray(chunk_rows), point, _computed_name(r))
             )
-            parts.append([x[: len(rows) - first] for x in found])
+            parts.append([x[: len(rows) - first] for x in chunk_results])
         value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
         value = value / r.quantity.factor
         counts = (outcome == CONVERGED) & np.isfinite(value)
@@ -343,11 +343,12 @@ def _check_requirement(held: _QuantityOfRobot) -> RequirementOutcome:
 
 def _named_corner(held: _QuantityOfRobot, k: int) -> Json:
     """A point as entries with the names of a requirements file."""
-    r, at = held.requirement, held.at
+    r, point = held.requirement, held.at
     e = r.envelope
     places = {
-        PAYLOAD: ("payload_kg", at.payload), SLOPE: ("slope_deg", at.slope_deg), AMBIENT: ("ambient_C", at.ambient),
-        CHARGE: ("state_of_charge" if e.battery else "supply_voltage_V", at.charge),
+        PAYLOAD: ("payload_kg", point.payload), SLOPE: ("slope_deg", point.slope_deg),
+        AMBIENT: ("ambient_C", point.ambient),
+        CHARGE: ("state_of_charge" if e.battery else "supply_voltage_V", point.charge),
     }  # fmt: skip
     corner: Json = {places[a][0]: round(float(np.asarray(places[a][1])[k]), 9) for a in r.quantity.axes}
     if r.name == "endurance_min":

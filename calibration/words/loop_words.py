@@ -631,8 +631,8 @@ def moved_parameter(name: str, value: float, stated: float, unit: str, shift: fl
 
 def effect_amplitude(e: FoundEffect) -> str:
     """Amplitude of an effect: `-0.0154 ± 0.00014`, with its unit where it has one."""
-    found = e.parameters["amplitude"]
-    return f"{found.value:.3g} ± {found.sd:.2g} {found.unit}".rstrip(" -")
+    amplitude = e.parameters["amplitude"]
+    return f"{amplitude.value:.3g} ± {amplitude.sd:.2g} {amplitude.unit}".rstrip(" -")
 
 
 def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:

@@ -256,9 +256,9 @@ class _SegmentIntegrator(NamedTuple):
         """A step of the planned length, limited by the end of the segment and the cut-off time of the cells.
 
         Returns:
-            Unknowns and integrals at its end, its length [s], True if it ends the segment or if the cut-off time of
-            the cells ends with it, True if its error is within the tolerance, and the length of the next step that
-            its error permits [s].
+            Unknowns and integrals at its end, its length [s], two flags, and the length of the next step that its
+            error permits [s]. The first flag is True if the segment or the cut-off time of the cells ends with it.
+            The second flag is True if its error is within the tolerance.
         """
         law, robot, otherwise, segment, *_ = self
 

@@ -1,10 +1,10 @@
 """Newton's method for a few unknowns over a large batch, with derivatives by the implicit function theorem.
 
-For 65 536 points of `steady` on two cores the loop takes 27 ms of processor time, and the same method called through
-optimistix 29 ms (medians of four turns of ten calls, alternating in one run, 2026-11-28). optimistix's `Newton` takes
-3.1 times as long, because it factorises by batched calls of LAPACK. The derivative is written here. A program with
-optimistix's derivative (`ImplicitAdjoint`) contains a host callback, through lineax. JAX's cache never stores such a
-program.
+For 65 536 points of `steady` on two cores the loop takes 27 ms of processor time. The same method called through
+optimistix takes 29 ms (medians of four turns of ten calls, alternating in one run, 2026-11-28). optimistix's `Newton`
+takes 3.1 times as long, because it factorises by batched calls of LAPACK. The derivative is written here. A program
+with optimistix's derivative (`ImplicitAdjoint`) contains a host callback, through lineax. JAX's cache never stores
+such a program.
 """
 
 from __future__ import annotations

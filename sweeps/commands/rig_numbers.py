@@ -46,8 +46,9 @@ class JointNumbers:
         file, joint: names of the file and the joint.
         rolls: True if the joint turns a wheel of a body that is free to move.
         stated: number [SI] for each key of `LINES`, None if the model has none. `mass` is that of the whole model,
-            `sides` the number of equal joints, `inertia` that of everything that turns with the joint, without
-            `armature`, `weight` the largest gravity torque, and `angle` that of the load at rest under gravity.
+            `sides` the number of equal joints, and `weight` the largest gravity torque. `inertia` is that of
+            everything that turns with the joint, without `armature`. `angle` is that of the load at rest under
+            gravity.
         drive: numbers of the motor by dotted name. They take precedence over values that follow from the others.
     """
 

@@ -239,8 +239,8 @@ def slope_certainty(rows: PaperRows) -> list[tuple[Any, ...]]:
     """R² (A1) of the current over slope, for each configuration and loading mode with measured rows.
 
     Returns:
-        Configuration, mode, R² of a straight line through the points and of the robot with its own adhesion, the
-        number of rows that settle with it, and R² with raised adhesion and with the robot's own mass.
+        Configuration, mode, R² of a straight line through the points, and R² of the robot with its own adhesion.
+        Then the number of rows that settle with it, and R² with raised adhesion and with the robot's own mass.
     """
     found = []
     for kind in rows.ratio:

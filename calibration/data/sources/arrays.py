@@ -123,13 +123,13 @@ def signals_of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
 
     arrays: dict[str, StoredArray] = {}
     units: dict[str, str] = {}
-    seen: set[int] = set()
+    addresses: set[int] = set()
 
     def add_group(group: Any, at: str) -> None:
         address = h5py.h5o.get_info(group.id).addr
-        if address in seen:  # a group with several paths is read only under the first one
+        if address in addresses:  # a group with several paths is read only under the first one
             return
-        seen.add(address)
+        addresses.add(address)
         for key in group:
             if not _inside(group, key, name):
                 continue

@@ -72,8 +72,10 @@ def _of_frame(frame: Any) -> Iterator[Signal]:
     import pyarrow as pa
 
     levels = [frame.index.get_level_values(level) for level in range(frame.index.nlevels)]
-    named = [(level.name or "time", level) for level in levels if level.name is not None or level.dtype.kind in "mM"]
-    for title, series in (*named, *((title, frame.iloc[:, j]) for j, title in enumerate(frame.columns))):
+    index_levels = [
+        (level.name or "time", level) for level in levels if level.name is not None or level.dtype.kind in "mM"
+    ]
+    for title, series in (*index_levels, *((title, frame.iloc[:, j]) for j, title in enumerate(frame.columns))):
         name = ".".join(filter(None, map(str, title if isinstance(title, tuple) else (title,))))
         try:
             yield from signals_of_arrow_table(pa.table([pa.array(series, from_pandas=True)], [name]))
@@ -150,17 +152,17 @@ def _signals(schema: Any, rows: int, column: Callable[[int], Any]) -> tuple[Sign
 
     signals = []
     for k, field in enumerate(schema):
-        kind, whole = field.type, functools.partial(column, k)
+        kind, read_column = field.type, functools.partial(column, k)
         if not (kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind)) or not rows:
-            signals.append(_signal(field, rows, whole))
+            signals.append(_signal(field, rows, read_column))
             continue
-        lengths = compute.unique(compute.list_value_length(whole())).to_pylist()
+        lengths = compute.unique(compute.list_value_length(read_column())).to_pylist()
         if len(lengths) != 1 or not lengths[0]:
             why = "holds lists of several lengths; expected one length in every row"
-            signals.append(Signal(field.name, rows, whole, refused=why))
+            signals.append(Signal(field.name, rows, read_column, refused=why))
             continue
         for j in range(min(lengths[0], MOST)):
-            element = functools.partial(lambda read, j: compute.list_element(read(), j), whole, j)
+            element = functools.partial(lambda read, j: compute.list_element(read(), j), read_column, j)
             signals.append(_signal(pa.field(f"{field.name}[{j}]", kind.value_type), rows, element))
     return tuple(signals)
 

@@ -189,23 +189,25 @@ def _of_signals(source: Source, layout: Layout, columns: Preset, between: str) -
     _check_any_found(source.name, columns, is_found, [s.path for s in signals])
     columns.check_needed(mapped, layout.imposed_column, source.name)
     mapped = presets_file.merge_columns(mapped, layout.mapped)
-    chosen, clock, missing = _chosen_signals(source, mapped, layout)
-    for column, signal in chosen.items():
+    signals_by_column, clock, missing = _chosen_signals(source, mapped, layout)
+    for column, signal in signals_by_column.items():
         if signal.refused:
             read_as = "" if column == signal.path else f" (read as {column})"
             raise BadData(f"{source.name}, {signal.path}: {signal.refused}{read_as}")
-    has_clocks = any(s.clock is not None for s in chosen.values())
-    extras = {} if has_clocks else _extra_columns(source, chosen)
-    size = input_files.VALUE * sum(s.length for s in (*chosen.values(), *extras.values()))
+    has_clocks = any(s.clock is not None for s in signals_by_column.values())
+    extras = {} if has_clocks else _extra_columns(source, signals_by_column)
+    size = input_files.VALUE * sum(s.length for s in (*signals_by_column.values(), *extras.values()))
     input_files.check_memory(source.name, size)
-    chosen = {name: _decoded_signal(columns.column_of(name), signal) for name, signal in chosen.items()}
+    signals_by_column = {
+        name: _decoded_signal(columns.column_of(name), signal) for name, signal in signals_by_column.items()
+    }
     if has_clocks:
-        values, more = _on_a_grid(source, chosen, layout, between, clock, mapped)
+        values, more = _on_a_grid(source, signals_by_column, layout, between, clock, mapped)
     else:
-        values, more = _in_rows(source, chosen), ()
+        values, more = _in_rows(source, signals_by_column), ()
         values |= _in_rows(source, extras, len(next(iter(values.values()), [])))
     notes = (*source.notes, *more, *notes, *weakened_field_notes(columns, values), *missing)
-    return _arrays(source, values, chosen, notes), mapped
+    return _arrays(source, values, signals_by_column, notes), mapped
 
 
 def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, Names]:
@@ -294,10 +296,10 @@ def _on_a_grid(
             "lines)"
         )
     measured = {c for c in chosen if column_of[c] in (*layout.measured_columns, *layout.deviation_columns)}
-    held = chosen.keys() - measured
+    stepwise = chosen.keys() - measured
     if between == "linear" or layout.imposed_column == SPEED:
-        held -= {c for c in chosen if column_of[c] == layout.imposed_column}
-    time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, held, measured, clock)
+        stepwise -= {c for c in chosen if column_of[c] == layout.imposed_column}
+    time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, stepwise, measured, clock)
     rest = {c: s for c, s in signals.items() if s.clock is None}
     return {"time_s": time, **values, **_in_rows(source, rest, len(time))}, notes
 

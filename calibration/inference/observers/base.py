@@ -339,9 +339,9 @@ class Observer(eqx.Module):
 
         def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
             parts = []
-            for at, member in zip(z, members, strict=True):
+            for point, member in zip(z, members, strict=True):
                 member_problem = problem.with_data(weight=jnp.asarray(weights[member]))
-                parts.append(self.at(member_problem, at, None if active is None else active[member]))
+                parts.append(self.at(member_problem, point, None if active is None else active[member]))
             return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
 
         steps = self.policy.steps if most is None else most

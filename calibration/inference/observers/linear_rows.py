@@ -53,12 +53,12 @@ class LinearRows(Observer):
         if not hasattr(coordinates, "active"):
             return errors
         _, amplitude, shape = coordinates.parts(z)
-        before, here, after = self.grid
-        rise = (shape[:, None] - before) / (here - before)
-        fall = (after - shape[:, None]) / (after - here)
+        before, peak, after = self.grid
+        rise = (shape[:, None] - before) / (peak - before)
+        fall = (after - shape[:, None]) / (after - peak)
         share = jnp.clip(jnp.minimum(*(jnp.where(jnp.isfinite(x), x, 1.0) for x in (rise, fall))), 0.0, 1.0)
-        own = self.effect == jnp.asarray(coordinates.active)[:, None]
-        return errors + self.width * linear.signatures @ jnp.sum(amplitude[:, None] * own * share, 0)
+        membership = self.effect == jnp.asarray(coordinates.active)[:, None]
+        return errors + self.width * linear.signatures @ jnp.sum(amplitude[:, None] * membership * share, 0)
 
     def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Any:
         data = problem.data
@@ -139,5 +139,5 @@ def _evaluated(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> t
     jacobian = [scale[:, None] * slopes, jnp.zeros((len(penalties), len(z))), jnp.eye(len(z))]
     status = jnp.full(len(penalties), CONVERGED)
     reading = errors.reshape(data.weight.shape) + data.measured
-    seen = Observation(reading, penalties, status, jnp.zeros_like(status))
-    return r, jnp.concatenate(jacobian), seen
+    observation = Observation(reading, penalties, status, jnp.zeros_like(status))
+    return r, jnp.concatenate(jacobian), observation

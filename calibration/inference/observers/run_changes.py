@@ -39,11 +39,12 @@ def sensor_readings(robot: Robot, signals: Signals) -> Array:
 def changes_of_run(
     robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...], *, kind: Any, delayed: bool
 ) -> Callable[[Conditions, Array, Array, LinearisedRun, Array, Array], tuple[Array, Array]]:
-    """Function of a run that returns the changes of its readings: by an error of the balance of each probe at each
-    knot, shape (probes, knots, samples, channels), and by each effect, shape (samples, channels, instances).
+    """Function of a run that returns two changes of its readings.
 
-    Arguments of the function: conditions of the run, times of its knots [s], index of the instant of each sample, the
-    simulated run, times of its instants, and times of its samples [s].
+    The first is by an error of the balance of each probe at each knot, shape (probes, knots, samples, channels). The
+    second is by each effect, shape (samples, channels, instances). The function takes the conditions of the run, the
+    times of its knots [s], and the index of the instant of each sample. Its other arguments are the simulated run,
+    the times of its instants, and the times of its samples [s].
 
     Args:
         kind: type of the numbers.
@@ -51,8 +52,8 @@ def changes_of_run(
     """
     requested, size = [p.balance for p in probes], len(probes)
     others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance not in ("sensor", *requested))
-    every = (*probes, *map(linearization.balance_probe, others))
-    places, none = [*requested, *others], jnp.zeros(len(every))
+    all_probes = (*probes, *map(linearization.balance_probe, others))
+    places, none = [*requested, *others], jnp.zeros(len(all_probes))
     instances = [e.effect for e in effects for _ in e.at]
     # Index of the probe of each instance's balance, and 1 if there is one; 1 if it is an error of a channel.
     entering = np.array([places.index(e.balance) if e.balance in places else 0 for e in instances], int)
@@ -62,7 +63,7 @@ def changes_of_run(
     effects = tuple(linearization.with_shape_of_robot(robot, e) for e in effects)
 
     def probed(amplitude: Array) -> Robot:
-        return linearization.with_probes(robot, every, amplitude)
+        return linearization.with_probes(robot, all_probes, amplitude)
 
     def of_run(
         conditions: Conditions, clock: Array, instants: Array, along: LinearisedRun, times: Array, time: Array

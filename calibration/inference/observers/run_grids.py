@@ -72,9 +72,9 @@ def grids_of_log(
     every_row = linear or rig.imposed == "motor_speed"
     averaged = runs.log is not None and rig.imposed == "motor_current" and not linear
     noted = []
-    for own, rows in zip(own_rows, log_rows, strict=True):
+    for run_rows, rows in zip(own_rows, log_rows, strict=True):
         # Rows of the log without a reading here are kept if the imposed quantity changes there.
-        keeps = np.isin(time[rows], runs["time_s"][own]) | every_row
+        keeps = np.isin(time[rows], runs["time_s"][run_rows]) | every_row
         keeps = keeps | _drive_changes(log, rows, SMALL if averaged else 0.0)
         if averaged:
             keeps = _begins_new_step(time[rows], keeps | np.append(_near_rest(log, robot, rows, RESTS), True))
@@ -170,8 +170,8 @@ def _average_imposed_current(runs: Runs, each: list[np.ndarray], noted: list[np.
             np.add.reduceat(x, first) for x in (charge, lasts, charge * middle, lasts * middle)
         )
         centre = middles / np.where(span > 0, span, 1.0)
-        moved = (total * centre - moment)[:-1] / np.where(span[1:] > 0, np.diff(centre), np.inf)
-        total += np.append(moved, 0.0) - np.append(0.0, moved)
+        transfer = (total * centre - moment)[:-1] / np.where(span[1:] > 0, np.diff(centre), np.inf)
+        total += np.append(transfer, 0.0) - np.append(0.0, transfer)
         mean = np.where(span > 0, total / np.where(span > 0, span, 1.0), drive[rows[first]])
         drive[rows] = mean[np.cumsum(begins) - 1]
     return dataclasses.replace(runs, columns={**runs.columns, column: drive})
