@@ -160,8 +160,8 @@ def _repeat_instruction(happens: bases.Window) -> str:
     """The same runs, where something happens for a while or at one level."""
     if happens.axis == "order":
         return (
-            f"Repeat runs {happens.low:.0f} to {happens.high:.0f} in a different order, mixed with as many other runs. "
-            "If the error returns, their conditions cause it"
+            f"Repeat runs {happens.low:.0f} to {happens.high:.0f} in a different order, mixed with as many other "
+            "runs. If the error returns, their conditions cause it"
         )
     if happens.axis != "time":
         return f"Repeat the runs at {happens.words} on another day, with some slightly below and above"

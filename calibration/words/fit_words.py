@@ -264,7 +264,8 @@ def residual_cluster(c: ResidualCluster) -> str:
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "feedforward_sign": (
-        "Velocity and voltage have opposite signs. This fit flips the velocity. Invert one of them in the robot's code."
+        "Velocity and voltage have opposite signs. This fit flips the velocity. Invert one of them in the robot's "
+        "code."
     ),
     "feedforward_speed_sign": (
         "Velocity and position have opposite signs. This fit flips the velocity. Invert one of them in the robot's "
