@@ -18,6 +18,7 @@ from calibration.data.row_checks import JUMP, time_constant
 from calibration.data.runs import Runs
 from calibration.data.unused_readings import drive_heading
 from mmrjax.model import channels, params
+from mmrjax.model.gearmotor import slow_motor_current, slow_output_torque
 from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
@@ -113,25 +114,11 @@ def _gearbox_fact(robot: Robot) -> DerivedFact:
     return DerivedFact("gearbox", text, odd)
 
 
-def _output_torque_at(robot: Robot, current: float) -> float:
-    """Output torque of one drive at a motor current, after losses [N·m]."""
-    motor, gear = robot.motor, robot.gearbox
-    friction = float(motor.friction_coulomb) + float(gear.friction_coulomb)
-    return (float(motor.torque_constant) * current - friction) * float(gear.ratio) * float(gear.efficiency_load)
-
-
-def _current_for_torque(robot: Robot, torque: float) -> float:
-    """Motor current for an output torque at low speed [A]."""
-    motor, gear = robot.motor, robot.gearbox
-    friction = float(motor.friction_coulomb) + float(gear.friction_coulomb)
-    return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + friction) / float(motor.torque_constant)
-
-
 def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterator[DerivedFact]:
     """Current for a torque, compared with the stall current if a voltage limit is stated."""
     if not robot.knows(["motor.torque_constant"]):
         return
-    current, limit = _current_for_torque(robot, torque), robot.motor.voltage_limit
+    current, limit = slow_motor_current(robot.motor, robot.gearbox, torque), robot.motor.voltage_limit
     fact = _fact(what, current, "A per motor", (0, 200), f"check {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
         stall = float(robot.motor.current_stall(limit))
@@ -181,7 +168,7 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     yield replace(fact, value=f"{grip:.0f}°", odd=odd or fact.odd)
     if limit is None or not robot.knows(["motor.resistance"]):
         return
-    pull = (_output_torque_at(robot, float(motor.current_stall(limit))) - loss) * sides / radius
+    pull = (slow_output_torque(motor, robot.gearbox, float(motor.current_stall(limit))) - loss) * sides / radius
     climb = pull / weight - resistance
     yield DerivedFact(
         f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V",
@@ -239,8 +226,10 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     if column != CURRENT or not loads:
         return ""
     needed = max(
-        _current_for_torque(
-            robot, abs(float(x.loss_coulomb)) + abs(float(x.torque_constant)) + abs(float(x.torque_gravity))
+        slow_motor_current(
+            robot.motor,
+            robot.gearbox,
+            abs(float(x.loss_coulomb)) + abs(float(x.torque_constant)) + abs(float(x.torque_gravity)),
         )
         for x in loads
     )
@@ -384,7 +373,7 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    at_zero, at_one = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
+    at_zero, at_one = (slow_output_torque(robot.motor, robot.gearbox, x) for x in (0.0, 1.0))  # linear in the current
     stall = np.maximum(at_zero + (at_one - at_zero) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
     exceeds_stall = braked & (np.abs(runs[LOAD]) > BEYOND * stall)

@@ -268,3 +268,16 @@ class Gearbox(eqx.Module):
         """Total loss at the output M_rf [N·m], eq. (22), driving forward."""
         load = torque_input * self.ratio * (1 - self.efficiency_load)
         return load + self.torque_idle(speed, 1.0) * self.ratio * self.efficiency_load
+
+
+def slow_output_torque(motor: Motor, gearbox: Gearbox, current: float) -> float:
+    """Output torque of a drive that turns slowly at a motor current, after losses [N·m], eqs. (16), (22)."""
+    friction = float(motor.friction_coulomb) + float(gearbox.friction_coulomb)
+    return (float(motor.torque_constant) * current - friction) * float(gearbox.ratio) * float(gearbox.efficiency_load)
+
+
+def slow_motor_current(motor: Motor, gearbox: Gearbox, torque: float) -> float:
+    """Motor current for an output torque of a drive that turns slowly [A], the inverse of `slow_output_torque`."""
+    friction = float(motor.friction_coulomb) + float(gearbox.friction_coulomb)
+    transmitted = torque / (float(gearbox.ratio) * float(gearbox.efficiency_load))
+    return (transmitted + friction) / float(motor.torque_constant)

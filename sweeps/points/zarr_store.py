@@ -576,6 +576,29 @@ def create_store(path: Path, layout: StoreLayout) -> None:
         zarr.consolidate_metadata(path)
 
 
+#: Most points of a sample of a store, and most chunks to take them from.
+THINNED, SAMPLED_CHUNKS = 200_000, 100
+
+
+def sample_store(store: Path, layout: StoreLayout) -> tuple[Columns, Columns]:
+    """Varied values and outputs by name, at a random selection of the points, always the same."""
+    import zarr
+
+    group: Any = zarr.open_group(store, mode="r")
+    rng, blocks, design = np.random.default_rng(0), layout.blocks, layout.design
+    chunks = np.sort(rng.permutation(len(blocks))[:SAMPLED_CHUNKS])
+    points_per_chunk = -(-THINNED // len(chunks))
+    values, outputs = list[np.ndarray](), {name: list[np.ndarray]() for name in layout.variables}
+    for chunk in map(int, chunks):
+        box, count = blocks.box(chunk), blocks.count(chunk)
+        rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
+        values.append(design.values_in_slices(box)[rows])
+        for name, parts in outputs.items():
+            parts.append(group[name][box].ravel()[rows])
+    varied = dict(zip(design.names, np.concatenate(values).T, strict=True))
+    return varied, {name: np.concatenate(parts) for name, parts in outputs.items()}
+
+
 def _on_disk(size: int) -> int:
     return -(-size // BLOCK) * BLOCK
 

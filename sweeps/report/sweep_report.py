@@ -17,8 +17,8 @@ from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import signals
 from sweeps import capabilities
 from sweeps.pages import words
+from sweeps.points import zarr_store
 from sweeps.points.tasks import LARGEST, SIZE, VERDICT
-from sweeps.points.zarr_store import STORE, StoreLayout
 from sweeps.report import catalogue, run_tables
 from sweeps.report.climb_report import VERDICTS
 from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table, remarks
@@ -132,11 +132,11 @@ def _extremes(runs: Columns, names: Iterable[str]) -> Table:
     return catalogue.table("sweep.extremes", rows)
 
 
-#: Most points for figures and quantiles, and most chunks to take them from. Most outputs that are drawn.
-THINNED, CHUNKS, DRAWN = 200_000, 100, 6
+#: Most outputs that are drawn.
+DRAWN = 6
 
 
-def campaign_document(file: RobotFile, layout: StoreLayout, result: Json, store: Path) -> Document:
+def campaign_document(file: RobotFile, layout: zarr_store.StoreLayout, result: Json, store: Path) -> Document:
     """Report of a complete store.
 
     Args:
@@ -150,15 +150,19 @@ def campaign_document(file: RobotFile, layout: StoreLayout, result: Json, store:
         f"Sweep of {count_noun(total, 'point')}",
         f"{count_noun(total, 'point')}: {reached:,} {verdict_words}.",
         (
-            run_tables.note_on_robot(file, model, f"All points are in `{STORE}`."),
+            run_tables.note_on_robot(file, model, f"All points are in `{zarr_store.STORE}`."),
             run_tables.endings_table(counts, "points", model),
         ),
         page_sections=lambda: _sections(store, layout, result["outputs"]),
     )
 
 
-def _sections(store: Path, layout: StoreLayout, extremes: Json) -> Iterable[Section]:
-    varied, points = sample_points(store, layout)
+def _sections(store: Path, layout: zarr_store.StoreLayout, extremes: Json) -> Iterable[Section]:
+    values, points = zarr_store.sample_store(store, layout)
+    varied = {
+        name: VariedQuantity(column, Column(name, _unit(layout, name)).title, layout.labels.get(name, ()))
+        for name, column in values.items()
+    }
     yield Section("What varies", (_varied_rows(layout, varied),), "varied")
     if VERDICT in points:
         codes, axes = points[VERDICT].astype(int), layout.design.axes
@@ -183,7 +187,7 @@ def _at_points(varied: Mapping[str, VariedQuantity], rows: np.ndarray) -> dict[s
 
 
 def _outputs(
-    varied: Mapping[str, VariedQuantity], found: Columns, layout: StoreLayout, extremes: Json
+    varied: Mapping[str, VariedQuantity], found: Columns, layout: zarr_store.StoreLayout, extremes: Json
 ) -> Iterable[Block]:
     """Section on the outputs, with extremes and quantiles. The first ones are drawn."""
     settled = np.isin(found[STATUS], signals.DONE)
@@ -226,34 +230,12 @@ def _largest_obstacle(varied: Mapping[str, VariedQuantity], found: Columns) -> s
     return f"The largest obstacle that the robot gets over: {sizes[k]:.4g} mm{rest}."
 
 
-def sample_points(store: Path, layout: StoreLayout) -> tuple[dict[str, VariedQuantity], Columns]:
-    """Varied quantities and outputs by name, at a random selection of the points, always the same."""
-    import zarr
-
-    group: Any = zarr.open_group(store, mode="r")
-    rng, blocks, design = np.random.default_rng(0), layout.blocks, layout.design
-    chunks = np.sort(rng.permutation(len(blocks))[:CHUNKS])
-    points_per_chunk = -(-THINNED // len(chunks))
-    values, outputs = list[np.ndarray](), {name: list[np.ndarray]() for name in layout.variables}
-    for chunk in map(int, chunks):
-        box, count = blocks.box(chunk), blocks.count(chunk)
-        rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
-        values.append(design.values_in_slices(box)[rows])
-        for name, parts in outputs.items():
-            parts.append(group[name][box].ravel()[rows])
-    varied = {
-        name: VariedQuantity(column, Column(name, _unit(layout, name)).title, layout.labels.get(name, ()))
-        for name, column in zip(design.names, np.concatenate(values).T, strict=True)
-    }
-    return varied, {name: np.concatenate(parts) for name, parts in outputs.items()}
-
-
-def _unit(layout: StoreLayout, name: str) -> str:
+def _unit(layout: zarr_store.StoreLayout, name: str) -> str:
     """Unit of a varied quantity, empty for a number without one."""
     return str(layout.coordinates[name].get("units", "").removeprefix("1"))
 
 
-def _varied_rows(layout: StoreLayout, varied: Mapping[str, VariedQuantity]) -> Table:
+def _varied_rows(layout: zarr_store.StoreLayout, varied: Mapping[str, VariedQuantity]) -> Table:
     """Varied names in words, one row for each."""
     rows = []
     for name, quantity in varied.items():
