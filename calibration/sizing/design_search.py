@@ -43,8 +43,8 @@ TRIES = 6
 #: Rows of one call of `_evaluate_designs`.
 ROWS = 8192
 #: Number of choices whose best random design is refined with three points along each axis, and number of designs that
-#: are refined after that, with any ratio and fractions of a cell. Points along each axis, rounds, and shrinkage of the
-#: box per round.
+#: are refined after that, with any ratio and fractions of a cell. Points along each axis, rounds, and shrinkage of
+#: the box per round.
 COARSE, REFINED, ALONG, ROUNDS, SHRINK = 300, 24, 7, 7, 0.45
 #: Half width of the first box [ratio of each number, logarithm].
 WIDTH = 0.25
