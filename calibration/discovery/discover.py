@@ -168,8 +168,8 @@ class Stage(NamedTuple):
     Attributes:
         name: name of the stage, and of its file if it is stored.
         inputs: results of earlier stages that it needs, as fields of `LoopStages`.
-        function: function of the `LoopInput` and of these results. It returns its results (those of the last stage
-            by name), or all results of the loop if these reach the verdict.
+        function: function of the `LoopInput` and of these results. It returns its results, or all results of the
+            loop if these reach the verdict.
         results: fields of `LoopStages` that it sets.
         stored: True if its results are stored. "search" stores each of its rounds.
     """
@@ -197,10 +197,8 @@ def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.L
             results = given.keep(stage.name, make) if stage.stored else make()
             if isinstance(results, verdict.LoopStages):
                 return results
-            if not isinstance(results, dict):
-                values = results if len(stage.results) > 1 else (results,)
-                results = dict(zip(stage.results, values, strict=False))
-            traced = dataclasses.replace(traced, **results)
+            each = results if len(stage.results) > 1 else (results,)
+            traced = dataclasses.replace(traced, **dict(zip(stage.results, each, strict=False)))
     return traced
 
 
@@ -285,5 +283,6 @@ STAGES = (
     Stage("mechanism", ("searched", "chosen", "standing", "beside", "predicted"),
           stages.trace_mechanism, ("mechanism",)),
     Stage("alternatives", ("searched", "chosen", "beside"), stages.find_alternatives, ("searched", "alike")),
-    Stage("claim", ("searched", "chosen", "alike", "standing", "beside", "mechanism"), stages.reach_verdict),
+    Stage("claim", ("searched", "chosen", "alike", "standing", "beside", "mechanism"),
+          stages.reach_verdict, ("verdict", "searched", "alike", "standing", "where", "held_out")),
 )  # fmt: skip

@@ -232,26 +232,26 @@ def reach_verdict(
     standing: loop_notes.NameSupport,
     beside: BaseCurve,
     mechanism: loop_notes.Mechanism | None,
-) -> dict[str, Any]:
-    """Verdict: effects, classes of effects, a mechanism, or a place. Hold-out errors may choose leading effects.
-
-    Returns the changed results by their names in `LoopStages`.
-    """
+) -> tuple[Any, ...]:
+    """Verdict: effects, classes of effects, a mechanism, or a place. Hold-out errors may choose leading effects."""
     named = [] if chosen is None else [standing.established(e) for e in chosen[0].effects]
     if chosen is None or alike is None or not any(named):
         level = "place" if mechanism is None or mechanism.fails else "mechanism"
-        return {"verdict": level, "where": dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs))}
-    (best, after), changed = chosen, dict[str, Any]()
+        return (
+            level,
+            searched,
+            alike,
+            standing,
+            dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs)),
+            (),
+        )
+    (best, after), held_out = chosen, verdict.LoopStages.held_out
     if given.settings.prefer == HELD_OUT:
         given.progress(progress_remark("held out"))
         leading, after, alike, held_out = preference.prefer_by_held_out(beside, given.runs, best, after, alike)
-        changed = {
-            "searched": dataclasses.replace(searched, best=leading, diagnosis=after),
-            "alike": alike,
-            "standing": standing.with_leaders(dict(zip(best.active, leading.active, strict=True))),
-            "held_out": held_out,
-        }
-    if after.test.rejected_with_margin:
-        changed["where"] = discrepancy.locate_discrepancy(after, beside.bases, beside.space.included)
+        searched = dataclasses.replace(searched, best=leading, diagnosis=after)
+        standing = standing.with_leaders(dict(zip(best.active, leading.active, strict=True)))
+    rejected = after.test.rejected_with_margin
+    rest = discrepancy.locate_discrepancy(after, beside.bases, beside.space.included) if rejected else None
     alone = all(one for one, name in zip(alike.alone, named, strict=True) if name)
-    return {"verdict": "named" if alone else "class", **changed}
+    return "named" if alone else "class", searched, alike, standing, rest, held_out
