@@ -689,7 +689,7 @@ MORE_NAMES = {
     "mmrjax/climbing/climb_simulation.py": 34,
     "mmrjax/fidelities/drive.py": 32,
     "mmrjax/fidelities/simulation.py": 28,
-    "mmrjax/fidelities/steady.py": 42,
+    "mmrjax/fidelities/steady.py": 36,
     "mmrjax/fidelities/track.py": 30,
     "mmrjax/missions/mission.py": 30,
     "mmrjax/model/balances.py": 27,

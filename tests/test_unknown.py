@@ -63,13 +63,18 @@ def read(tmp_path, text, imposed, more=""):
 
 
 def elsewhere(robot):
-    """The same rig beside another packaged robot: three times of what is unknown of its motor and battery."""
+    """The same rig beside another packaged robot: three times of what is unknown of its motor and battery.
+
+    The inductance that nobody stated follows the resistance: robot files assume the time constant of the winding.
+    """
     drive = [
         p
         for p in params.walk_parameters(robot)
         if p.name in robot.rig.unknown and not p.name.startswith("running_gear.")
     ]
     values = {p.name: jnp.clip(3.0 * jnp.asarray(p.value), *p.spec.bounds) for p in drive}
+    if "motor.resistance" in values:
+        values["motor.inductance"] = robot.motor.inductance / robot.motor.resistance * values["motor.resistance"]
     return dataclasses.replace(params.replace(robot, values), rig=robot.rig)
 
 

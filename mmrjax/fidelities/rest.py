@@ -65,6 +65,13 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
 
 
+def output_is_held(conditions: Conditions) -> Array:
+    """True where a clamp holds the output, or an imposed speed of 0 holds it against a load torque."""
+    if conditions.motor_speed is not None and conditions.load_torque is not None:
+        return (conditions.motor_speed == 0) & (conditions.load_torque != 0)
+    return jnp.asarray(0.0 if conditions.held is None else conditions.held) > 0.5
+
+
 def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
     """Voltage of the driver at motors at rest without current [V]."""
     if conditions.motor_speed is not None:  # the voltage of the imposed speed
@@ -252,8 +259,8 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
         return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
     way, wait = compute_if_needed(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
-    clamped = jnp.asarray(0.0 if conditions.held is None else conditions.held) > 0.5
-    return jnp.where(clamped, HELD, way), jnp.where(clamped, 0.0, wait)
+    is_clamped = output_is_held(conditions)
+    return jnp.where(is_clamped, HELD, way), jnp.where(is_clamped, 0.0, wait)
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.fidelities import outputs
+from mmrjax.fidelities import outputs, rest
 from mmrjax.fidelities.base import (
     Fidelity,
     ImplicitSolution,
@@ -22,15 +22,6 @@ from mmrjax.fidelities.base import (
     result_of_signals,
     travel_status,
     withhold_numbers,
-)
-from mmrjax.fidelities.rest import (
-    admitted_current,
-    is_at_rest,
-    slides_in_place,
-    standing_signals,
-    travel_direction,
-    voltage_at_rest,
-    without_diode,
 )
 from mmrjax.model import balances, channels, contact, params
 from mmrjax.model.conditions import Conditions
@@ -75,9 +66,9 @@ def _signals_and_residuals(
     """
     speed, scaled_current, third = unknowns
     conditions, speed_motor = _clamped_conditions(conditions, third)
-    current, is_limited = admitted_current(robot, conditions, _CURRENT * scaled_current)
+    current, is_limited = rest.admitted_current(robot, conditions, _CURRENT * scaled_current)
     state = State(current, _SPEED_MOTOR * speed_motor, _SPEED * speed, conditions.discharge)
-    signals, creep = _balanced(without_diode(robot), conditions, state, sense)
+    signals, creep = _balanced(rest.without_diode(robot), conditions, state, sense)
     # Moving with balanced torques, or at rest with too little torque: speed >= 0 and torque <= 0 in the direction of
     # travel, and one of them is 0.
     lacking, moving = -sense * signals.torque_net / _TORQUE, sense * third
@@ -96,18 +87,14 @@ def _signals_and_residuals(
     return state, signals, (slip, voltage, torque)
 
 
-def _is_held(conditions: Conditions) -> Bool[Array, "..."]:
-    """True where a clamp holds the output, or an imposed speed of 0 holds it against a load torque."""
-    if conditions.motor_speed is not None and conditions.load_torque is not None:
-        return (conditions.motor_speed == 0) & (conditions.load_torque != 0)
-    return jnp.asarray(0.0 if conditions.held is None else conditions.held) > 0.5
-
-
 def _clamped_conditions(conditions: Conditions, third: Scalar) -> tuple[Conditions, Scalar]:
     """Conditions with the clamp's torque as the load, and the motor speed in the unit of its unknown."""
     if conditions.held is None:
         return conditions, third
-    is_clamped, load = _is_held(conditions), 0.0 if conditions.load_torque is None else conditions.load_torque
+    is_clamped, load = (
+        rest.output_is_held(conditions),
+        0.0 if conditions.load_torque is None else conditions.load_torque,
+    )
     carried = replace(conditions, load_torque=jnp.where(is_clamped, _TORQUE * third, load))
     return carried, jnp.where(is_clamped, 0.0, third)
 
@@ -140,7 +127,7 @@ def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, 
 
 
 def _initial_guess(robot: Robot, conditions: Conditions) -> Vector:
-    nominal = voltage_at_rest(robot, conditions)
+    nominal = rest.voltage_at_rest(robot, conditions)
     speed = nominal * (0.9 / robot.motor.torque_constant)
     if conditions.motor_speed is not None:
         speed = conditions.motor_speed
@@ -159,7 +146,7 @@ def _search_arguments(robot: Robot, conditions: Conditions) -> tuple[Callable, V
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _conditions_are_sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_initial_guess(robot, sound))
-    return _residuals, start, robot, (conditions, travel_direction(robot, sound)), tolerance
+    return _residuals, start, robot, (conditions, rest.travel_direction(robot, sound)), tolerance
 
 
 def _solve_balances(robot: Robot, conditions: Conditions) -> tuple[Vector, Array]:
@@ -181,7 +168,7 @@ def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
         return _turning_signals(robot, conditions)
     unknowns, _ = _solve_balances(robot, conditions)
     _, sound = _conditions_are_sound(robot, conditions)
-    return _signals_and_residuals(robot, sound, unknowns, travel_direction(robot, sound))[1]
+    return _signals_and_residuals(robot, sound, unknowns, rest.travel_direction(robot, sound))[1]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -246,7 +233,7 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
 
 def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     robot = robot.within(conditions.configuration)
-    return slides_in_place(robot, _conditions_are_sound(robot, conditions)[1])
+    return rest.slides_in_place(robot, _conditions_are_sound(robot, conditions)[1])
 
 
 def operating_state(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
@@ -267,11 +254,11 @@ def _state_at_unknowns(
     detached = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
     robot = robot.within(conditions.configuration)
     sound, conditions = _conditions_are_sound(robot, conditions)
-    sense = travel_direction(robot, conditions)
+    sense = rest.travel_direction(robot, conditions)
     state, signals, residual = _signals_and_residuals(robot, conditions, unknowns, sense)
     speed_still = robot.chassis(conditions.configuration).speed_still
-    voltage = voltage_at_rest(robot, conditions)
-    at_rest = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, speed_still)
+    voltage = rest.voltage_at_rest(robot, conditions)
+    at_rest = rest.is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, speed_still)
     at_rest |= sense * signals.speed_theoretical <= 1e-9
     # In the order in which they matter to a reader.
     status = jnp.where(at_rest, STALLED, travel_status(signals.speed, voltage))
@@ -285,10 +272,12 @@ def _state_at_unknowns(
         status = jnp.where(exceeds_adhesion, jnp.where(is_sliding, SLIDES, STALLED), status)
     if rests and conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
-        stands_still &= ~_is_held(conditions) | (sense * unknowns[2] <= 1e-9)  # friction leaves the clamp nothing
-        static = standing_signals(robot, _clamped_conditions(conditions, 0.0)[0], state)
-        signals = jax.tree.map(lambda rest, travel: jnp.where(stands_still, rest, travel), static, signals)
-    status = jnp.where(_is_held(conditions), CONVERGED, status)
+        stands_still &= ~rest.output_is_held(conditions) | (
+            sense * unknowns[2] <= 1e-9
+        )  # friction leaves the clamp nothing
+        static = rest.standing_signals(robot, _clamped_conditions(conditions, 0.0)[0], state)
+        signals = jax.tree.map(lambda still, moving: jnp.where(stands_still, still, moving), static, signals)
+    status = jnp.where(rest.output_is_held(conditions), CONVERGED, status)
     status = jnp.where(solved, status, FAILED)
     status = jnp.where(robot.battery.emptied(conditions.battery, conditions.discharge), BATTERY_EMPTY, status)
     status = jnp.where(sound, status, FAILED)
