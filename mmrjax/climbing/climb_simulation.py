@@ -198,25 +198,22 @@ def build_climb_system(
     mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
     robot, gear = robot.within(conditions.configuration), robot.running_gear
     chassis = robot.chassis(conditions.configuration)
-    half, shape = (
-        without_levers(robot, conditions, mass),
-        footing.contact_shape_of_robot(chassis, gear, robot.radius_pulley),
-    )
+    half = without_levers(robot, conditions, mass)
+    shape = footing.contact_shape_of_robot(chassis, gear, robot.radius_pulley)
     none = jnp.zeros_like(chassis.on_tracks)
     lever = jnp.stack([gear.lever_mass, gear.lever_centre, gear.lever_inertia]) * jnp.stack(
         [chassis.on_tracks, jnp.ones(()), chassis.on_tracks]
     )
-    main, rotor_inertia = (
-        jax.tree.map(lambda part, whole: jnp.where(chassis.on_tracks > 0.5, part, whole), track, without)
-        for track, without in zip(
+    main_track, lever_track = (
+        jax.tree.map(lambda tracked, wheeled: jnp.where(chassis.on_tracks > 0.5, tracked, wheeled), *tracks)
+        for tracks in zip(
             gear.levers.tracks(chassis.track),
             (chassis.track, dataclasses.replace(chassis.track, loss_coulomb=none, loss_viscous=none)),
             strict=True,
         )
     )
-    chassis = dataclasses.replace(chassis, track=main)
+    chassis = dataclasses.replace(chassis, track=main_track)
     robot = eqx.tree_at(lambda r: r.configurations.chosen, robot, chassis)
-    drive = lever_drive(robot)
     return ClimbSystem(
         robot,
         conditions,
@@ -226,9 +223,9 @@ def build_climb_system(
         half,
         lever,
         chassis,
-        rotor_inertia,
-        drive,
-        jnp.asarray(step, float),
+        lever_track,
+        drive=lever_drive(robot),
+        step=jnp.asarray(step, float),
     )
 
 
@@ -418,18 +415,17 @@ def advance_climb(
     full_matrix = full_matrix.at[LED, LED].add(1 - run.chassis.on_tracks)
     pushed = step * (force - bias)
     factors = factorise(full_matrix[:4, :4])
-    acceleration, *coupled = (
-        solve_factorised(factors, x) for x in (pushed[:4], full_matrix[:4, 4], full_matrix[:4, 5])
-    )
+    # Change of the other velocities while the levers keep theirs, and its share per change of the levers' rates.
+    change, *coupled = (solve_factorised(factors, x) for x in (pushed[:4], full_matrix[:4, 4], full_matrix[:4, 5]))
     coupling = jnp.stack(coupled, axis=1)
     coupled_matrix = full_matrix[4:, 4:] - full_matrix[4:, :4] @ coupling
     inverse = jnp.array(
         [[coupled_matrix[1, 1], -coupled_matrix[0, 1]], [-coupled_matrix[1, 0], coupled_matrix[0, 0]]]
     ) / (coupled_matrix[0, 0] * coupled_matrix[1, 1] - coupled_matrix[0, 1] * coupled_matrix[1, 0])
-    lever_speeds = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ acceleration)
+    lever_speeds = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ change)
     swung = _drive_action(run, motion, time, signals.voltage_source, lever_speeds, step * inverse / robot.sides)
     led = swung.rate - motion.v[LED]
-    gained = jnp.concatenate([acceleration - coupling @ led, led])
+    gained = jnp.concatenate([change - coupling @ led, led])
     v = motion.v + gained
     middle = motion.v + gained / 2
 
@@ -723,16 +719,14 @@ def climb_batch(
         progress: callback with the finished share of the time.
     """
     parts, samples, steps = divide_run(duration, step, sample, part)
-    interval, step_numbers = (
-        jnp.asarray(step, float),
-        jnp.asarray(steps),
-    )  # arrays: one program for all lengths of a step
+    # Arrays: one program for all lengths of a step.
+    interval, steps_per_sample = jnp.asarray(step, float), jnp.asarray(steps)
     state = _begin(robot, conditions, terrain, sequence, interval, start)
     records: list[ClimbRecord] = []
     for k in range(parts):
-        first_step = jnp.asarray(k * samples * steps * step)
+        begins = jnp.asarray(k * samples * steps * step)
         state, passed = _compiled(
-            robot, conditions, terrain, sequence, state, first_step, interval, step_numbers, samples
+            robot, conditions, terrain, sequence, state, begins, interval, steps_per_sample, samples
         )
         verdict = np.asarray(state[2].verdict)
         last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)

@@ -111,17 +111,15 @@ def time_grid(
         young = np.log1p(grows * np.minimum(t, knee) / first) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
-    at, ends, at_knee = (
-        step_count(times[:-1] - interval_start),
-        step_count(times[1:] - interval_start),
-        step_count(knee),
+    begin_count, end_count, knee_count = map(
+        step_count, (times[:-1] - interval_start, times[1:] - interval_start, knee)
     )
     instants = []
     for k in range(len(times) - 1):
-        count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
-        even_places = np.linspace(at[k], ends[k], count, endpoint=False)
-        young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(even_places, at_knee[k]))
-        instants.append(interval_start[k] + young + np.maximum(even_places - at_knee[k], 0.0) * longest[k])
+        count = max(1, int(np.ceil(end_count[k] - begin_count[k] - 1e-9)))
+        counts = np.linspace(begin_count[k], end_count[k], count, endpoint=False)
+        young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(counts, knee_count[k]))
+        instants.append(interval_start[k] + young + np.maximum(counts - knee_count[k], 0.0) * longest[k])
         instants[-1][0] = times[k]
     all_instants = np.concatenate([*instants, times[-1:]])
     return np.interp(
@@ -307,7 +305,7 @@ def _decay_over_parts(begin: Array, decay: Array, parts: Pair, wait: Scalar = 0.
 
 
 def _lag_rates(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Float[Array, " rates"]:
-    """Rates that determine the lag of a step, see `Step.rates_at_start`."""
+    """Rates that determine the lag of a step, see `RunStep.rates_at_start`."""
     return step.rates_at_start(constant, lambda y, held: winding_rate(robot, held, y), y)
 
 
@@ -420,18 +418,18 @@ def solve_states(robot: Robot, conditions: Conditions, times: Times) -> RunState
         law = functools.partial(drive_rates, robot, conditions)
 
         def turned(part: _StepPart) -> _StepPart:
-            member_decay = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
-            first = part.begin - member_decay.begin * _unit_vector_of_current(y)
+            part_lag = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
+            first = part.begin - part_lag.begin * _unit_vector_of_current(y)
 
             def solve_next_stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
                 now = functools.partial(law, way=part.side)
                 stage_result = _solve_stage(
-                    now, *given, part.length, mean * _unit_vector_of_current(y), member_decay.decay
+                    now, *given, part.length, mean * _unit_vector_of_current(y), part_lag.decay
                 )
                 return (first + (1 - _GAMMA) / _GAMMA * (stage_result - first), stage_result), stage_result
 
-            stages = jax.lax.scan(solve_next_stage, (first, first), member_decay.means)[1]
-            end = stages[1] + member_decay.end * _unit_vector_of_current(y)
+            stages = jax.lax.scan(solve_next_stage, (first, first), part_lag.means)[1]
+            end = stages[1] + part_lag.end * _unit_vector_of_current(y)
             before, after = part.begin[MOTOR], end[MOTOR]
             nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
             rests, waited, rest = part.turn == TURNS, part.turn == WAITS, end - after * along
@@ -447,7 +445,7 @@ def solve_states(robot: Robot, conditions: Conditions, times: Times) -> RunState
             return _StepPart(
                 jnp.where(nears, part.turn + 1, jnp.where(rests, after_rest, WAITS + 2 - waited)),
                 jnp.where(rests, rest, jnp.where(waited, end, part.begin)),
-                jnp.where(rests | waited, member_decay.end, part.lag),
+                jnp.where(rests | waited, part_lag.end, part.lag),
                 since,
                 jnp.where(nears, to_rest, step_left),
                 jnp.where(rests, side, jnp.where(waited, part.then, part.side)),

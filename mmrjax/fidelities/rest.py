@@ -132,10 +132,8 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
         conditions: voltage or current imposed, no speed.
         state: state with the current that flows at rest.
     """
-    robot, conditions = (
-        robot.within(conditions.configuration),
-        balances.with_controller_duty(robot, conditions, state),
-    )
+    robot = robot.within(conditions.configuration)
+    conditions = balances.with_controller_duty(robot, conditions, state)
     chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _without_motion(state)
     # About to turn forward and backward: the two limits of friction.
     ends = [balances.settled_signals(robot, conditions, still, way)[0] for way in (1.0, -1.0)]

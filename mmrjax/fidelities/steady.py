@@ -91,10 +91,8 @@ def _clamped_conditions(conditions: Conditions, third: Scalar) -> tuple[Conditio
     """Conditions with the clamp's torque as the load, and the motor speed in the unit of its unknown."""
     if conditions.held is None:
         return conditions, third
-    is_clamped, load = (
-        rest.output_is_held(conditions),
-        0.0 if conditions.load_torque is None else conditions.load_torque,
-    )
+    is_clamped = rest.output_is_held(conditions)
+    load = 0.0 if conditions.load_torque is None else conditions.load_torque
     carried = replace(conditions, load_torque=jnp.where(is_clamped, _TORQUE * third, load))
     return carried, jnp.where(is_clamped, 0.0, third)
 

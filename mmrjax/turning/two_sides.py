@@ -275,8 +275,8 @@ class GroundForceInputs(NamedTuple):
         if loads is not None:
             return _forces_at_loads(loads, None, self)
         detached_inputs = jax.lax.stop_gradient(self)
-        at, rise = _solve_loads(detached_inputs)
-        forces = _forces_at_loads(at, None, self)
+        solved_loads, rise = _solve_loads(detached_inputs)
+        forces = _forces_at_loads(solved_loads, None, self)
         # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
         change = _load_step(forces.lacking, rise.lacking)
         return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
@@ -305,8 +305,8 @@ def _solve_loads(given: GroundForceInputs) -> tuple[Pair, GroundForces]:
             slope, residual = jax.jacfwd(lacking, has_aux=True)(loads)
             return loads - _load_step(residual, slope)
 
-        loads_found = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
-        return loads_found, jax.jacfwd(lambda x: _forces_at_loads(x, even, given))(loads_found)
+        loads = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
+        return loads, jax.jacfwd(lambda x: _forces_at_loads(x, even, given))(loads)
 
     nothing = load * given.sliding[0]
     first_loads = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
@@ -315,7 +315,7 @@ def _solve_loads(given: GroundForceInputs) -> tuple[Pair, GroundForces]:
     lifts = (stance.on_tracks > 0.5) & (
         jnp.maximum(jnp.abs(first_loads[1]), jnp.abs(solution[0][1])) > stance.length / 6
     )
-    return compute_if_needed(lifts, lambda at, given: steps(at, given, None), (first_loads, given), solution)
+    return compute_if_needed(lifts, lambda loads, given: steps(loads, given, None), (first_loads, given), solution)
 
 
 def _moment_arguments(centre: Scalar, given: GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:
@@ -332,8 +332,8 @@ def _forces_at_loads(loads: Array, even: Array | None, given: GroundForceInputs)
     The lateral speed is linear along a contact, and so is its load. Forces and moments are therefore sums of four
     moments of the law over a uniform load. `even`: these moments, if known.
     """
-    (moments, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
-    normal = jnp.maximum(load / 2 - 2 * SIDES * moments, 0.0)
+    (transferred, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
+    normal = jnp.maximum(load / 2 - 2 * SIDES * transferred, 0.0)
     place, half, tilt = loaded_part(stance, centre)
     arm = place - stance.ahead
     law, sliding, middle, end = _moment_arguments(centre, given)
@@ -352,7 +352,7 @@ def _forces_at_loads(loads: Array, even: Array | None, given: GroundForceInputs)
         aside=aside,
         moment=arm * aside + half * turning_force,
         across=middle * aside + end * turning_force,
-        moved=moments,
+        moved=transferred,
         centre=centre,
         lacking=loads - jnp.stack([outward, stance.ahead - behind]),
     )

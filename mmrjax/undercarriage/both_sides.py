@@ -118,10 +118,11 @@ def _contacts_of_sides(run: HalfRobotSystem, motion: HalfRobotState) -> _Contact
     of_q = jnp.stack([nothing, heights, q[PITCH] + nothing, *q[PULLEYS].T], axis=1)
     of_v = jnp.stack([speed - v[YAW] * y, rises, v[PITCH] + nothing, *v[PULLEYS].T], axis=1)
     touching = jax.vmap(lambda q, v: side_contacts.compute_contacts(run.path, run.chassis, q, v))(of_q, of_v)
-    own, ratio = run.chassis.turning, balances.lateral_friction(run.conditions, run.chassis)
-    law = ContactLaw(run.chassis.ground.friction, ratio ** (2 * own.rule - 2), run.chassis.on_tracks, own.nodes)
+    turning, ratio = run.chassis.turning, balances.lateral_friction(run.conditions, run.chassis)
+    rule = turning.rule
+    law = ContactLaw(run.chassis.ground.friction, ratio ** (2 * rule - 2), run.chassis.on_tracks, turning.nodes)
     aside = lateral + v[YAW] * touching.lever_x - v[ROLL] * touching.lever_z
-    return _ContactsOfSides(run.path, law, ratio**own.rule, touching, aside, heights)
+    return _ContactsOfSides(run.path, law, ratio**rule, touching, aside, heights)
 
 
 def _resolve_signals(
@@ -161,7 +162,7 @@ _ContactLevers = tuple[Array, Array, Array]
 
 def _contact_levers(run: HalfRobotSystem, motion: HalfRobotState, at: ContactState) -> _ContactLevers:
     cos, sin = _heading(motion)
-    one, y = jnp.ones_like(at.gap), (_places_of_sides(run))[:, None]
+    one, y = jnp.ones_like(at.gap), _places_of_sides(run)[:, None]
     none = jnp.zeros_like(one)
     front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
     x, z = at.lever_x, at.lever_z
@@ -256,19 +257,17 @@ def _step_forces(run: HalfRobotSystem, motion: HalfRobotState, stored: bool = Fa
     use.
     """
 
-    def found(x: Any) -> Any:
-        return jax.lax.optimization_barrier(x) if stored else x
-
-    sides = found(_contacts_of_sides(run, motion))
-    signals, pulled = found(_resolve_signals(run, plane_motion(run, motion), sides))
+    store = jax.lax.optimization_barrier if stored else lambda x: x
+    sides = store(_contacts_of_sides(run, motion))
+    signals, pulled = store(_resolve_signals(run, plane_motion(run, motion), sides))
     damping, levers, rises = damping_matrix(run, motion, signals, sides, pulled)
     mass, bias = mass_matrix_and_bias(run, motion, run.robot.sides / 2 * half_robot.armature_inertia(run, signals))
     push = run.step * (generalized_forces(run, motion, signals, sides.at, pulled) - bias)
     return _StepForces(sides, signals, pulled, levers, rises, mass, damping, push)
 
 
-def _solver(run: HalfRobotSystem, found: _StepForces) -> Callable[[Coordinates], Coordinates]:
-    factors = factorise(found.mass + run.step * found.damping)
+def _solver(run: HalfRobotSystem, forces: _StepForces) -> Callable[[Coordinates], Coordinates]:
+    factors = factorise(forces.mass + run.step * forces.damping)
     return functools.partial(solve_factorised, factors)
 
 
@@ -287,27 +286,27 @@ def advance(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[HalfRobotStat
 @advance.def_jvp
 def _differentiated(primals: tuple[HalfRobotSystem, HalfRobotState], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
     """See `half_robot.advance`. K enters only by its product with Δv."""
-    found = _step_forces(*primals)
-    solve = _solver(primals[0], found)
-    gained = solve(found.push)
+    forces = _step_forces(*primals)
+    solve = _solver(primals[0], forces)
+    gained = solve(forces.push)
 
-    def held(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Array, _StepForces]:
+    def imbalance(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Array, _StepForces]:
         forces = _step_forces(run, motion, stored=True)
-        fallen = _damping_product(run, motion, forces, gained)
-        return forces.push - forces.mass @ gained - run.step * fallen, forces
+        damped = _damping_product(run, motion, forces, gained)
+        return forces.push - forces.mass @ gained - run.step * damped, forces
 
-    _, (force_residual, changed) = eqx.filter_jvp(held, primals, tangents)
-    return eqx.filter_jvp(_state_after_step, (*primals, found, gained), (*tangents, changed, solve(force_residual)))
+    _, (change, changed_forces) = eqx.filter_jvp(imbalance, primals, tangents)
+    return eqx.filter_jvp(_state_after_step, (*primals, forces, gained), (*tangents, changed_forces, solve(change)))
 
 
 def _damping_product(
-    run: HalfRobotSystem, motion: HalfRobotState, found: _StepForces, gained: Coordinates
+    run: HalfRobotSystem, motion: HalfRobotState, forces: _StepForces, gained: Coordinates
 ) -> Coordinates:
     """Product K Δv without forming K, see `damping_matrix`."""
-    touching, pulled, levers = found.sides.at, found.pulled, found.levers
+    touching, pulled, levers = forces.sides.at, forces.pulled, forces.levers
     assert pulled.aside is not None
-    after = contact_forces_after_step(touching, pulled, levers, found.rises, gained)
-    losses, shafts = _loss_derivatives(run, plane_motion(run, motion), found.sides)
+    after = contact_forces_after_step(touching, pulled, levers, forces.rises, gained)
+    losses, shafts = _loss_derivatives(run, plane_motion(run, motion), forces.sides)
     (cos, sin), y = _heading(motion), _places_of_sides(run)
     ahead, turn = cos * gained[X] + sin * gained[Y], gained[YAW]
     rolling_damping = losses * (ahead - y * turn)
@@ -322,17 +321,17 @@ def _damping_product(
 
 
 def _state_after_step(
-    run: HalfRobotSystem, motion: HalfRobotState, found: _StepForces, gained: Coordinates
+    run: HalfRobotSystem, motion: HalfRobotState, forces: _StepForces, gained: Coordinates
 ) -> tuple[HalfRobotState, balances.Travel, Pair]:
     v = motion.v + gained
 
-    def later(own: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
-        of_side = replace(run, conditions=own), replace(motion, memory=memory)
+    def later(conditions: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
+        of_side = replace(run, conditions=conditions), replace(motion, memory=memory)
         return half_robot.other_states_after_step(*of_side, signals)
 
-    current, discharge, memory = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
+    current, discharge, memory = jax.vmap(later)(run.conditions.of_sides(), forces.signals, motion.memory)
     after = HalfRobotState(motion.q + run.step * v, v, current, discharge[0], memory)
-    return after, _signals_after_step(run, motion, found, gained), found.pulled.guided
+    return after, _signals_after_step(run, motion, forces, gained), forces.pulled.guided
 
 
 def contact_forces_after_step(
@@ -354,11 +353,11 @@ def contact_forces_after_step(
 
 
 def _signals_after_step(
-    run: HalfRobotSystem, motion: HalfRobotState, found: _StepForces, gained: Coordinates
+    run: HalfRobotSystem, motion: HalfRobotState, forces: _StepForces, gained: Coordinates
 ) -> balances.Travel:
     """All signals of a step, with its forces at the end of the step to first order."""
-    sides, signals, touching, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
-    ahead, aside, normal = contact_forces_after_step(touching, found.pulled, found.levers, found.rises, gained)
+    sides, signals, touching, several = forces.sides, forces.signals, forces.sides.at, run.robot.sides / 2
+    ahead, aside, normal = contact_forces_after_step(touching, forces.pulled, forces.levers, forces.rises, gained)
     forward = run.half.centre[0]
     arm = touching.lever_x - forward
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
@@ -402,15 +401,15 @@ def stand(run: HalfRobotSystem) -> HalfRobotState:
 
 
 def roll(run: HalfRobotSystem) -> HalfRobotState:
-    """In the settled turn of the steady fidelity, at rest if it has none."""
-    begins = stand(run)
+    """Initial motion: the settled turn of the steady fidelity, or rest if there is none."""
+    at_rest = stand(run)
     rolls = circling.motion_of_unknowns(run.robot, circling.turning_start(run.robot, run.conditions, rolling=True))
     cos, sin = cosine(rolls.heading), sine(rolls.heading)
     lateral = rolls.speed_lateral - run.half.centre[0] * rolls.yaw_rate
     shafts = rolls.speed_motor / run.robot.gearbox.ratio
     plane = [cos * rolls.speed - sin * lateral, sin * rolls.speed + cos * lateral, rolls.yaw_rate]
-    v = begins.v.at[PLANE].set(jnp.stack(plane)).at[PULLEYS].set(shafts[:, None])
-    return replace(begins, v=v, current=rolls.current, memory=rolls.memory)
+    v = at_rest.v.at[PLANE].set(jnp.stack(plane)).at[PULLEYS].set(shafts[:, None])
+    return replace(at_rest, v=v, current=rolls.current, memory=rolls.memory)
 
 
 def loads(run: HalfRobotSystem, at: ContactState, pulled: ContactPull) -> GearReactions:

@@ -249,10 +249,10 @@ def _implicit_step(run: HalfRobotSystem, motion: HalfRobotState) -> _StepFactors
     damping = damping_matrix(run, motion, signals, touching, pulled)
     factors = factorise(mass + run.step * damping)
     gained = solve_factorised(factors, mass @ (pushed - motion.v))
-    after, is_over = _state_after_motion(
+    after, signals_of_step = _state_after_motion(
         motion, run.step, other_states_after_step(run, motion, signals), damping @ gained, gained, signals
     )
-    return _StepFactors(after, is_over, pulled.guided, damping, factors, gained, signals.speed_slip_terms)
+    return _StepFactors(after, signals_of_step, pulled.guided, damping, factors, gained, signals.speed_slip_terms)
 
 
 def other_states_after_step(
@@ -311,20 +311,20 @@ def _differentiated(
     differentiated = tuple(name for name, change in constants.items() if change is not None)
     contact_inputs = _contact_inputs(run, motion) | {"slip": step.slip}
     linearized = contact_sums.linearize(run.path, run.chassis, contact_inputs, step.gained, differentiated)
-    (residual, fallen, later, signals, _), d_held = eqx.filter_jvp(
+    (residual, fallen, later, signals, _), d_residual = eqx.filter_jvp(
         lambda run, motion: _step_residual(run, motion, step.gained, linearized), (run, motion), (d_run, d_motion)
     )
-    d_left, d_fallen, d_later, d_signals, d_guided = d_held
+    d_left, d_fallen, d_later, d_signals, d_guided = d_residual
     # None: the differentiated quantity does not enter.
     d_gained = jnp.zeros_like(residual) if d_left is None else solve_factorised(step.factors, d_left)
     through = step.damping[:2] @ d_gained
     d_fallen = through if d_fallen is None else d_fallen + through
-    _, (d_after, d_over) = eqx.filter_jvp(
+    _, (d_after, d_signals_of_step) = eqx.filter_jvp(
         _state_after_motion,
         (motion, run.step, later, fallen, step.gained, signals),
         (d_motion, d_run.step, d_later, d_fallen, d_gained, d_signals),
     )
-    return (step.after, step.signals, step.guided), (d_after, d_over, d_guided)
+    return (step.after, step.signals, step.guided), (d_after, d_signals_of_step, d_guided)
 
 
 def _contact_inputs(run: HalfRobotSystem, motion: HalfRobotState) -> dict[str, Scalar]:

@@ -80,8 +80,8 @@ class Levers(eqx.Module):
         def share(coulomb: Scalar, viscous: Scalar) -> Track:
             return replace(side, loss_coulomb=coulomb * side.loss_coulomb, loss_viscous=viscous * side.loss_viscous)
 
-        own_share = share(self.share_coulomb, self.share_viscous)
-        return share(1 - 2 * self.share_coulomb, 1 - 2 * self.share_viscous), own_share
+        lever_track = share(self.share_coulomb, self.share_viscous)
+        return share(1 - 2 * self.share_coulomb, 1 - 2 * self.share_viscous), lever_track
 
 
 __all__ = ["GROUSERS", "TEETH_BELT", "TEETH_PULLEY", "WHEELS", "RunningGear"]
