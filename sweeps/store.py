@@ -45,35 +45,26 @@ def print_report(document: Document, file: RobotFile | None = None, brief: bool 
     )
 
 
-def finish_run_folder(
-    folder: Folder,
-    config: RobotPart,
-    manifest: Json,
-    *,
-    robot: Robot | None = None,
-    note: str = "",
-    solved: bool = True,
-    page: Page | None = None,
-    runs: Runs | None = None,
-) -> int:
-    """Writes the configuration and the page (if wanted), moves the folder into place and prints its path.
+def finish_run_folder(folder: Folder, manifest: Json, page: Page, solved: bool = True) -> int:
+    """Writes configuration, robot and page, moves the folder into place and prints its path.
 
     Args:
-        folder: folder with the command's own files.
-        robot: robot that is written as `robot.toml` with a note, unless the command has written it.
+        folder: folder with the command's own files. A `robot.toml` among them is kept.
         manifest: entries in addition to program, versions and hashes.
-        runs: the table whose hash is recorded, if any.
+        page: function that writes the page, called if the configuration wants one.
         solved: True if every solver gave an answer.
 
     Returns:
         Exit code: 0, or 3 if a solver failed.
     """
-    if robot is not None:
-        robot_file.write_robot(robot, folder.results() / "robot.toml", note=f"{note}, from {config.robot}")
+    results, config = folder.results(), folder.config
+    if not (results / "robot.toml").exists():
+        note = f"the robot of this run, from {config.robot}"
+        robot_file.write_robot(folder.robot, results / "robot.toml", note=note)
     folder.write_text("config.resolved.toml", configuration.as_toml(config))
-    if page is not None and getattr(config, "report", True):
-        page(folder.results())
-    print_output(str(folder.finish(manifest, runs)))
+    if getattr(config, "report", True):
+        page(results)
+    print_output(str(folder.finish(manifest)))
     return DONE if solved else SOLVER_FAILED
 
 
@@ -103,8 +94,16 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "l
 
 
 class Folder:
-    """Folder with the files of a command, named `path` + `.partial` until it is complete and moved into place."""
+    """Folder with the files of a command, named `path` + `.partial` until it is complete and moved into place.
 
+    Attributes:
+        config, robot: configuration of the command, and its robot.
+        runs: table whose hash the manifest records, if any.
+    """
+
+    config: RobotPart
+    robot: Robot
+    runs: Runs | None = None
     #: Names that a finished folder may contain besides those of the manifest, if the process was killed while moving
     #: it.
     further: Names = (LOCK,)
@@ -239,15 +238,15 @@ class Folder:
         """Writes a table as CSV and, if requested, as Parquet. Numbers that are not finite become empty cells."""
         writing.write_table(self.results() / name, columns, self.tables)
 
-    def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
+    def finish(self, manifest: Json) -> Path:
         """Writes the manifest and moves the folder into place. Returns its path.
 
-        The manifest also has hashes of `robot.toml` and of the file of `runs`, if any, and the names of all files:
+        The manifest also has hashes of `robot.toml` and of the file of runs, if any, and the names of all files:
         `--force` deletes nothing else.
         """
         hashes = {"robot": sha256_hex((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
-        if runs is not None and runs.digest:
-            hashes[runs.source] = runs.digest
+        if self.runs is not None and self.runs.digest:
+            hashes[self.runs.source] = self.runs.digest
         names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS} - self._foreign()
         import jax
         import jax.numpy as jnp
@@ -368,14 +367,14 @@ class RunFolder(Folder):
                 command was interrupted there.
         """
         super().__init__(path)
-        self._force, self._command = force, str(identity.get("command", ""))
+        self._force, self.command = force, str(identity.get("command", ""))
         self._digest = identity_digest(identity)
         self._lock: TextIO | None = None
         self._taken_up = False
         self.refuse_taken(force)
         try:
             while self._lock is None:
-                self.refuse_foreign(self._command, force)
+                self.refuse_foreign(self.command, force)
                 self._lock = self._entered()
             self._begin_or_take_up()
         except BadConfiguration:
@@ -422,7 +421,7 @@ class RunFolder(Folder):
                 print_message(f"{self.partial}: was made with another configuration and is started again")
             self._clear()
             self._lock.truncate(0)
-            self._lock.write(lock_text(self._command, self._digest))
+            self._lock.write(lock_text(self.command, self._digest))
             self._lock.flush()
         (self.partial / CHUNKS).mkdir(exist_ok=True)
 
@@ -518,6 +517,7 @@ def open_folder(
         beside.out or default_path(command), run_identity(command, config, robot, runs), force=beside.force
     )
     folder.tables = getattr(config, "table", folder.tables)
+    folder.config, folder.robot, folder.runs = config, robot, runs
     return folder
 
 

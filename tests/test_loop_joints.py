@@ -237,7 +237,7 @@ def test_finished_joints_are_kept_and_all_are_on_one_page(mmrjax, tmp_path, monk
                 for which, x in (("before", 4.0), ("after", 2.0))
             }
             folder.write_json("result.json", {"statement": f"Friction of {runs.source}.", "errors": errors})
-            return finish_run_folder(folder, one, {}, robot=robot, runs=runs)
+            return finish_run_folder(folder, {}, lambda results: None)
 
     monkeypatch.setattr("sweeps.commands.loop._run_with_time_limit", loop)
     write(tmp_path, np.column_stack([np.arange(40) * 0.01, np.zeros((40, 4)), default_rng(0).random((40, 2))]))

@@ -48,14 +48,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
         document = print_report(report, brief=not beside.verbose)
         settled = result.converged and all(b.converged for h in result.held_out.values() for b in h.blocks.values())
         manifest = {"seed": result.seed, "statuses": result.counts}
-        return finish_run_folder(
-            folder,
-            config,
-            manifest,
-            solved=settled and words.every_run_solved(result.counts),
-            page=document,
-            runs=runs,
-        )
+        return finish_run_folder(folder, manifest, document, settled and words.every_run_solved(result.counts))
 
 
 #: Names of signals with the battery voltage.
@@ -67,7 +60,7 @@ ROTOR = "motor_speed_rpm", ""
 
 def _execute_feedforward(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
     """Fits the constants, prints them and writes a run folder. Returns the exit code, 0."""
-    if has_robot := config.robot != "nominal":
+    if config.robot != "nominal":
         robot = load_robot(config).robot
     else:
         with resources.as_file(resources.files("calibration.data") / "rigs" / "feedforward.toml") as path:
@@ -86,8 +79,7 @@ def _execute_feedforward(config: configuration.Calibrate, beside: configuration.
         folder.write_json("feedforward.json", fit.to_json())
         folder.write_table("windows.csv", fit.windows)
         page = print_report(calibration_report.feedforward_document(fit))
-        note = "the rig of this log" if has_robot else "a rig that reads this log"
-        return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=page, runs=runs)
+        return finish_run_folder(folder, {"seed": None}, page)
 
 
 def voltage_fit(runs: Runs) -> Feedforward | None:

@@ -68,6 +68,4 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
         )
         manifest = {"seed": None, **sheet.count_outcomes(result.outcomes)}
         solved = words.every_run_solved(Counter(o.status for o in result.outcomes))
-        return finish_run_folder(
-            folder, config, manifest, robot=result.robot, note="the robot of this check", solved=solved, page=document
-        )
+        return finish_run_folder(folder, manifest, document, solved)

@@ -74,15 +74,7 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         folder.write_json("result.json", climbed.to_json())
         document = print_report(climb_report.climb_document(climbed, file), file)
         manifest = {"seed": None, "verdict": climbed.verdict}
-        return finish_run_folder(
-            folder,
-            config,
-            manifest,
-            robot=robot,
-            note="the robot of this climb",
-            solved=climbed.verdict != "failed",
-            page=document,
-        )
+        return finish_run_folder(folder, manifest, document, climbed.verdict != "failed")
 
 
 def _climb_of_configuration(

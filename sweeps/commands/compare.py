@@ -98,8 +98,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
         )
         answer = comparison_report.comparison_answer(compared)
         further = {"statement": answer, "errors": summary, "notes": [*file.remarks, *notes]}
-        result = run.SimulationResult("compare", compared.model, robot, runs, table, further)
-        return run.write_run_folder(folder, config, result, document)
+        return run.write_run_folder(folder, compared.model, table, document, further)
 
 
 def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile | None:

@@ -32,15 +32,8 @@ def execute(config: configuration.Export, beside: configuration.FolderPart) -> i
         folder.write_text("LAW.md", export_report.law_text(exported))
         folder.write_json("result.json", to_json(exported))
         document = print_report(export_report.export_document(exported))
-        return finish_run_folder(
-            folder,
-            config,
-            {"seed": config.seed},
-            robot=file.robot,
-            note="what was exported",
-            page=document,
-            runs=exported.comparison.situation.runs,
-        )
+        folder.runs = exported.comparison.situation.runs
+        return finish_run_folder(folder, {"seed": config.seed}, document)
 
 
 def to_json(found: Export) -> Json:

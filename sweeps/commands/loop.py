@@ -131,7 +131,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         if config.report:
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": verdict.verdict}
-        return finish_run_folder(folder, config, manifest, solved=verdict.converged, page=page, runs=verdict.runs)
+        return finish_run_folder(folder, manifest, page, verdict.converged)
 
 
 @contextlib.contextmanager

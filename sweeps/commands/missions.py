@@ -103,9 +103,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, missions.course))
         if not missions.whole:
             print_message("history.csv is cut short: the mission has too many steps")
-        result = run.SimulationResult("simulate", config.model, robot, runs, missions.table, missions.to_json())
         page = print_report(mission_report.missions_document(file, missions), file)
-        return run.write_run_folder(folder, config, result, page)
+        return run.write_run_folder(folder, config.model, missions.table, page, missions.to_json())
 
 
 def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> None:

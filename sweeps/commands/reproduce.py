@@ -18,9 +18,8 @@ def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -
     file = load_robot(config)
     robot = file.robot
     capabilities.check_on_ground(robot, "reproduce")
-    runs = records.read_runs("measured")
     gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
-    with open_folder("reproduce", config, robot, beside) as folder:
+    with open_folder("reproduce", config, robot, beside, records.read_runs("measured")) as folder:
         document, rows = report.paper_document(file, gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:
@@ -35,13 +34,5 @@ def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -
                 "adhesion_raised": rows.ratio,
             }
         folder.write_json("result.json", result)
-        return finish_run_folder(
-            folder,
-            config,
-            {"seed": None},
-            robot=robot,
-            note="the robot of these figures",
-            solved=rows is None or "failed" not in rows.plain["status"],
-            page=print_report(document, file),
-            runs=runs,
-        )
+        solved = rows is None or "failed" not in rows.plain["status"]
+        return finish_run_folder(folder, {"seed": None}, print_report(document, file), solved)

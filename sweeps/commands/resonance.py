@@ -84,16 +84,7 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         folder.write_json("result.json", result.to_json())
         document = print_report(resonance_report.resonance_document(result, file), file)
         manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
-        return finish_run_folder(
-            folder,
-            config,
-            manifest,
-            robot=result.robot,
-            note="the robot of this map",
-            solved=solved,
-            page=document,
-            runs=runs,
-        )
+        return finish_run_folder(folder, manifest, document, solved)
 
 
 def _speed_grid(config: configuration.Resonance, voltages: tuple[float, ...]) -> GridPart:

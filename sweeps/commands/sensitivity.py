@@ -90,23 +90,14 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
         report_in_words(print_message), battery=float(config.battery),
         discharge=config.discharge_mAh * COULOMB_PER_MAH, adhesion=np.asarray(conditions.adhesion),
     )  # fmt: skip
-    with open_folder("sensitivity", config, robot, beside, runs) as folder:
+    with open_folder("sensitivity", config, file.robot, beside, runs) as folder:
         result = analyse_sensitivity(study, config.method, config.evaluations, config.seed)
         folder.write_json("result.json", result.to_json())
         for name, table in result.tables().items():
             folder.write_table(name, table)
         document = print_report(sensitivity_report.sensitivity_document(result, file), file)
         manifest = {"seed": result.seed, "statuses": result.statuses}
-        return finish_run_folder(
-            folder,
-            config,
-            manifest,
-            robot=file.robot,
-            note="the robot of this study",
-            solved=result.solved,
-            page=document,
-            runs=runs,
-        )
+        return finish_run_folder(folder, manifest, document, result.solved)
 
 
 def _operating_points(

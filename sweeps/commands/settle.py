@@ -32,15 +32,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
         folder.write_json("result.json", to_json(settled, few_runs_sentence))
         sign_sentences = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
         document = print_report(settle_report.settle_document(settled, few_runs_sentence, sign_sentences))
-        return finish_run_folder(
-            folder,
-            config,
-            {"seed": None, "settled": len(settled.kept)},
-            robot=robot,
-            note="the rig of this log",
-            page=document,
-            runs=runs,
-        )
+        return finish_run_folder(folder, {"seed": None, "settled": len(settled.kept)}, document)
 
 
 def segments_table(found: Settled) -> Columns:

@@ -91,10 +91,9 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             ]
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
-        result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
         of_page = dataclasses.replace(file, robot=shows_turns)
         document = runs_report.runs_document(of_page, config.model, table, histories, postures, remarks)
-        return run.write_run_folder(folder, config, result, print_report(document, of_page))
+        return run.write_run_folder(folder, config.model, table, print_report(document, of_page), further)
 
 
 def _simulate_table(

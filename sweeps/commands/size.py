@@ -64,4 +64,4 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
         )
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
         solved = words.every_run_solved(Counter(o.status for o in outcomes))
-        return finish_run_folder(folder, config, manifest, solved=solved, page=document)
+        return finish_run_folder(folder, manifest, document, solved)

@@ -83,9 +83,8 @@ def _sweep_into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> 
         if posterior is not None and config.posterior is not None:
             table |= run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
             notes = run.interval_ranges(table, robot.channels, config.posterior)
-        result = run.SimulationResult("sweep", config.model, robot, runs, table)
         document = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
-        return run.write_run_folder(folder, config, result, document)
+        return run.write_run_folder(folder, config.model, table, document)
 
 
 def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int:
@@ -235,14 +234,8 @@ def finish_sweep(
                     "hashes": same["data"],
                 }
                 document = sweep_report.campaign_document(file, store.layout, summary, store.partial / STORE)
-                finish_run_folder(
-                    store,
-                    config,
-                    manifest,
-                    robot=job.robot,
-                    note="the robot of this sweep",
-                    page=print_report(document, file),
-                )
+                store.config, store.robot = config, job.robot
+                finish_run_folder(store, manifest, print_report(document, file))
     done = store.done()
     if not store.finished:
         print_output(

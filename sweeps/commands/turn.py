@@ -84,7 +84,6 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         if postures is not None:
             folder.write_table("posture.csv", postures.table)
             notes.append(turn_words.posture_sentences(postures))
-        result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
         end = None
         if history is not None:
             yaw = np.degrees(np.asarray(history.reading["yaw"])[0])
@@ -94,7 +93,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
                 "turned_deg": float(yaw[-1] - yaw[0]),
             }
         document = runs_report.turn_document(file, config.model, table, end, history, turns, notes)
-        return run.write_run_folder(folder, config, result, print_report(document, file))
+        return run.write_run_folder(folder, config.model, table, print_report(document, file), {"turn": turn})
 
 
 def turn_columns(config: configuration.TurnPart, given: Json) -> Json:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -28,7 +27,6 @@ from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import DONE, FLAGS, STATUSES
 from sweeps import capabilities
-from sweeps import config as configuration
 from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress_bar
 from sweeps.pages import words
@@ -43,48 +41,6 @@ Table = Columns
 
 #: Number of steps of `compare` for each step of a fit.
 PARTS = 4
-
-
-@dataclasses.dataclass(frozen=True)
-class SimulationResult:
-    """Result of a command that simulates. All its files are written from it.
-
-    Attributes:
-        command: name of the command.
-        model: fidelity.
-        robot: robot that was simulated.
-        runs: runs that were simulated.
-        table: conditions and results by column, as in `runs.csv`.
-        further: further entries of `result.json`.
-    """
-
-    command: str
-    model: str
-    robot: Robot
-    runs: Runs
-    table: Columns
-    further: Json = dataclasses.field(default_factory=dict)
-
-    @property
-    def statuses(self) -> dict[str, int]:
-        """Number of runs with each status, zeros included."""
-        return {status: int(np.sum(self.table["status"] == status)) for status in STATUSES}
-
-    @property
-    def flags(self) -> dict[str, int]:
-        """Number of runs that exceed each limit."""
-        return {name: int(np.sum(np.char.find(self.table["flags"], name) >= 0)) for name in FLAGS}
-
-    def to_json(self) -> Json:
-        """`result.json`."""
-        return {
-            "schema": f"mmrjax.{self.command}/1",
-            **self.further,
-            "model": self.model,
-            "runs": len(self.table["status"]),
-            "statuses": self.statuses,
-            "flags": self.flags,
-        }
 
 
 def ending_columns(robot: Robot, batch: RunBatch) -> Columns:
@@ -216,32 +172,21 @@ def run_names(runs: Runs) -> np.ndarray:
     return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
 
 
-def write_run_folder(
-    folder: RunFolder,
-    config: configuration.Simulate | configuration.Sweep | configuration.Compare,
-    result: SimulationResult,
-    page: Page,
-) -> int:
+def write_run_folder(folder: RunFolder, model: str, table: Columns, page: Page, further: Json | None = None) -> int:
     """Writes the files common to all simulating commands, and moves the folder into place. Returns the exit code.
 
     Args:
-        folder: folder of the command.
-        config: its configuration, with the robot's name.
-        page: its page.
+        model: fidelity of the runs.
+        table: conditions and results by column.
+        page: page of the command.
+        further: further entries of `result.json`.
     """
-    folder.write_table("runs.csv", capabilities.drop_inapplicable_columns(result.robot, result.table))
-    folder.write_json("result.json", result.to_json())
-    manifest = {"seed": None, "statuses": result.statuses}
-    return finish_run_folder(
-        folder,
-        config,
-        manifest,
-        robot=result.robot,
-        note="the robot of this run",
-        solved=words.every_run_solved(result.statuses),
-        page=page,
-        runs=result.runs,
-    )
+    folder.write_table("runs.csv", capabilities.drop_inapplicable_columns(folder.robot, table))
+    statuses = {status: int(np.sum(table["status"] == status)) for status in STATUSES}
+    flags = {name: int(np.sum(np.char.find(table["flags"], name) >= 0)) for name in FLAGS}
+    about = {"model": model, "runs": len(table["status"]), "statuses": statuses, "flags": flags}
+    folder.write_json("result.json", {"schema": f"mmrjax.{folder.command}/1", **(further or {}), **about})
+    return finish_run_folder(folder, {"seed": None, "statuses": statuses}, page, words.every_run_solved(statuses))
 
 
 #: Suffixes of an output's columns: standard deviation, ends of the 95 % interval.
