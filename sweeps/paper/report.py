@@ -30,8 +30,8 @@ from sweeps.pages.figure_style import (
 from sweeps.pages.words import displayed_robot_name
 from sweeps.paper import data
 from sweeps.paper.components import MODEL
-from sweeps.report import catalogue
-from sweeps.report.document import Block, Cell, Column, Document, Section
+from sweeps.report import catalogue, fit_tables
+from sweeps.report.document import Block, Column, Document, Section
 from sweeps.report.fit_tables import error_cell
 from sweeps.report.runs_report import ripple_table, starts_table
 
@@ -86,6 +86,12 @@ def gear_blocks(robot: Robot) -> Iterator[Block]:
 # --- the report -----------------------------------------------------------------------------------
 
 
+#: Kinds of readings in the table of rows, by the prefix of their columns.
+KINDS = {
+    "": "bench", "paper_": "paper", "plain_": "own adhesion", "raised_": "adhesion raised", "weighed_": "own mass",
+}  # fmt: skip
+
+
 def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRows | None]:
     """Report on a robot, compared with the nominal robots.
 
@@ -120,13 +126,8 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRow
     def sections() -> Iterator[Section]:
         if own_rows is not None:
             yield _against_the_bench(robots, rows, name)
-        nominal = rows["nominal"]
-        raised = data.raised_adhesion_words(ROBOTS["nominal"](), nominal.ratio)
-        row_blocks = (
-            catalogue.note("paper.row-by-row", raised),
-            _paper_rows_table(nominal),
-        )
-        yield Section("The paper compared with itself, row by row", row_blocks, "rows-table")
+            table, shown = data.paper_rows_table(own_rows), data.channels_of_paper()
+            yield fit_tables.rows_section(table, shown, KINDS, False, mass=True, file="rows.csv")
         starts = data.simulate_starts(robot)
         figure = catalogue.figure("paper.fig23_24_from_standstill", starts, data.FIG_23, data.FIG_24)
         yield Section("From standstill", (figure, starts_table(starts)), "start")
@@ -200,35 +201,6 @@ def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows]
     if TRACKED in own_rows.ratio:
         blocks.append(catalogue.figure("paper.fig29_model_errors", robots, rows))
     return Section("Against the bench", tuple(blocks), "bench")
-
-
-def _paper_rows_table(rows: data.PaperRows) -> Block:
-    """The 20 rows: bench, the paper's simulation and three variants of the nominal robot. Wheeled rows appear a
-    second time with the robot's own mass.
-    """
-    table, own_mass = rows.conditions, rows.weighed["total_mass_kg"]
-    own, raised, weighed = (data.stack_channels(t) for t in (rows.plain, rows.raised, rows.weighed))
-    by_row = []
-    for k in range(len(table)):
-        names = ("configuration", "supply_voltage_V", "total_mass_kg", "slope_deg")
-        has_other_mass = abs(own_mass[k] - table["total_mass_kg"][k]) > 0.05
-        for first, mass in ((True, table["total_mass_kg"][k]), (False, own_mass[k]))[: 1 + has_other_mass]:
-            cells: list[object] = [table[n][k] if first else "" for n in names]
-            cells[2] = mass
-            for bench, paper, plain, found in zip(
-                rows.measured[k], rows.paper[k], own[k], (raised if first else weighed)[k], strict=True
-            ):
-                plain = plain if np.isfinite(plain) else Cell("slides", "slides")
-                cells += [bench, paper, plain] if first else [""] * 3
-                cells += [found if np.isfinite(found) else "no number"]
-                cells += [error_cell(float(simulation_errors.relative_error(found, x))) for x in (paper, bench)]
-            by_row.append(cells)
-    heads = []
-    for c in data.channels_of_paper():
-        form, group = f"{{:.{max(c.resolution - 1, 0)}f}}", f"{c.label} [{c.unit}]"
-        heads += [Column(word, form=form, group=group) for word in ("bench", "paper", "own", "raised")]
-        heads += [Column(f"Δ {word}", form="{:+.1f}", group=group) for word in ("paper", "bench")]
-    return catalogue.table("paper.rowtable", by_row, *heads)
 
 
 def _variants(name: str, rows: dict[str, data.PaperRows]) -> Columns:

@@ -22,8 +22,7 @@ from mmrjax.model.signals import FLAGS
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Column, Document, Note, Section, Table, columns, remarks
-from sweeps.report.run_tables import quantity_column
+from sweeps.report.document import Column, Document, Note, Section, Table, remarks
 from sweeps.report.runs_report import run_headings
 
 
@@ -67,19 +66,16 @@ class Missions:
         }
 
 
-#: Most segments of a cycle on a page.
-SEGMENTS = 60
 #: Quantities of each run, in the order of the table.
 _RUNS = (
     "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
     "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
     *(output.column for output in TABLE["mission of sides"]), "status", "flags",
 )  # fmt: skip
-#: Quantities of each segment, each with its total over several cycles.
-_OF_SEGMENTS = {
-    "energy_Wh": np.sum, "distance_m": np.sum, "rms_current_A": None, "peak_current_A": np.max,
-    "winding_peak_C": np.max,
-}  # fmt: skip
+#: Quantities of each segment.
+_OF_SEGMENTS = (
+    "energy_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C", "status", "flags",
+)  # fmt: skip
 
 
 def missions_document(file: RobotFile, found: Missions) -> Document:
@@ -228,34 +224,17 @@ def _charge_left(table: Columns) -> Iterable[str]:
 
 
 def _segments(found: Missions, name: str, idle: set[str]) -> Table:
-    """Table of the segments of a run: the first cycle, and totals over all cycles."""
-    source, many = found.source, found.source.cycles > 1
-    run_rows = found.segments["run_id"] == name
-    shown_columns = [c for c in _OF_SEGMENTS if c not in idle]
-    totals = {c: total for c in shown_columns if (total := _OF_SEGMENTS[c]) is not None and many}
-    total_energy, answer = float(np.sum(found.segments["energy_Wh"][run_rows])), []
-    for k in range(min(source.segment_count, SEGMENTS)):
-        picked = run_rows & (found.segments["segment"] == k + 1)
-        if not picked.any():
-            continue
-        rows = {key: value[picked] for key, value in found.segments.items()}
-        ends = Counter(map(words.short_status, map(str, rows["status"])))
-        flags = dict.fromkeys(flag for f in rows["flags"] for flag in str(f).split(";") if flag)
-        begin, end = source.time[k : k + 2] - source.time[0]
-        share = 100 * float(np.sum(rows["energy_Wh"])) / total_energy if total_energy > 0 else None
-        answer.append(
-            (
-                f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand_in_words(source, k),
-                *(rows[c][0] for c in shown_columns), *(total(rows[c]) for c, total in totals.items()),
-                *[share] * many,
-                ", ".join(f"{s} ({n})" if many else s for s, n in ends.items()),
-                ", ".join(words.FLAGS[f] for f in flags) or "none",
-            )
-        )  # fmt: skip
-    headings = [quantity_column(c, "first cycle" if many else "this segment") for c in shown_columns]
-    headings += [quantity_column(c, "all cycles") for c in totals]
-    headings += columns("all cycles > share of energy [%] | .1f") * many
-    return catalogue.table("mission.segments", answer, *headings)
+    """Table of the segments of a run, in the order of time."""
+    source, run_rows = found.source, found.segments["run_id"] == name
+    rows = {key: value[run_rows] for key, value in found.segments.items() if key not in idle}
+    places = rows["segment"] - 1
+    first = [
+        (Column("segment", form="{:d}"), rows["segment"]),
+        (Column("from", "s", "{:g}"), rows["time_s"]),
+        (Column("mode"), [source.modes[k].replace("_", " ") for k in places]),
+        (Column("demanded"), [_demand_in_words(source, k) for k in places]),
+    ]
+    return run_tables.quantity_table("segments", rows, _OF_SEGMENTS, first, file="segments.csv", wide=True)
 
 
 def _demand_in_words(source: ProfileTable, k: int) -> str:
