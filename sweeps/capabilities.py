@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from calibration.data import Columns, rig_file
+from calibration.data import Columns
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -18,7 +18,6 @@ from mmrjax.fidelities import outputs
 from mmrjax.model import params, quantities
 from mmrjax.model.channels import SIDES
 from mmrjax.model.conditions import OF_TURNS, sides_contradiction
-from mmrjax.model.paper_robots import blank_robot
 from mmrjax.model.paper_tables import VOLTAGES_V
 from mmrjax.model.power import Battery
 from mmrjax.model.quantities import RPM, WARMING
@@ -90,24 +89,13 @@ def drop_inapplicable_columns(robot: Robot, table: Columns) -> Columns:
     return {column: values for column, values in table.items() if column not in dropped}
 
 
-def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
-    """Parameters that a rig file states, and others with an effect: name, value, unit, meaning, source."""
-    robot = file.robot
-    bare = blank_robot(robot.configurations, rig=robot.rig)
-    nothing, stated_parameters = params.values_by_name(bare), []
-    for p in params.walk_parameters(robot):
-        head = p.name.partition(".")[0]
-        load = head in robot.configurations
-        is_own = p.name in file.stated and head not in file.linear
-        moved = p.name not in nothing or float(p.value) != nothing[p.name]
-        if not is_own and not moved and not (load and float(p.value) != 0):
-            continue
-        if not is_own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not robot.shows_travel)):
-            continue
-        of_file = is_own or head in file.linear
-        source = f"stated in {file.name}" if of_file else "default" if not moved or load else "changed"
-        stated_parameters.append((p.name, float(p.value), p.spec.unit, p.spec.meaning, source))
-    return stated_parameters
+def rig_parameters(file: RobotFile) -> list[tuple[Any, ...]]:
+    """Parameters that a rig's file or `--set` states: name, value, unit, meaning."""
+    return [
+        (p.name, float(p.value), p.spec.unit, p.spec.meaning)
+        for p in params.walk_parameters(file.robot)
+        if p.name in file.stated
+    ]
 
 
 def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:
@@ -196,14 +184,6 @@ def _stated_limit(robot: Robot, option: str, example: str) -> float:
         missing = f", and the robot's file has no motor.{about.limit}" * (robot.rig.imposed != "motor_current")
         raise BadConfiguration(f"{option}: not given{missing}; give it [{about.unit}], such as {option} {example}")
     return limit
-
-
-def imposed_example(robot: Robot) -> float:
-    """Imposed value for an example [V, rpm]: `imposed_default` if the file states a limit."""
-    try:
-        return imposed_default(robot, "")
-    except BadConfiguration:
-        return float(IMPOSED_WORDS[robot.rig.imposed].one)
 
 
 def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[float, ...]:

@@ -14,11 +14,9 @@ from calibration.data.input_errors import BadConfiguration, allowed_words, state
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
-from mmrjax.derived.turning_figures import turns_under_equal_commands
 from mmrjax.errors import list_some
 from mmrjax.model.paper_tables import BENCH, SURFACES
-from mmrjax.model.quantities import RPM
-from mmrjax.model.robot import Robot, turn_error
+from mmrjax.model.robot import Robot
 from sweeps import capabilities, store
 from sweeps.config import Calibrate, Compare, Export, FidelityPart, GivenRuns, Loop, OneRun, RobotPart, Simulate
 from sweeps.console import print_message
@@ -47,7 +45,9 @@ def load_robot(config: RobotPart) -> RobotFile:
             f"--robot {file.name}: its controller follows a goal; use calibrate, compare, loop or rig check with "
             "a log, export, or mmrjax.simulate in Python"
         )
-    unlike = () if getattr(config, "turns", False) else _unlike_sides_sentence(file.name, robot)
+    unlike: Names = ()
+    if robot.unlike and robot.has_ground and not getattr(config, "turns", False):
+        unlike = (turn_words.unlike_sides_note(file.name, robot),)
     examples = list_some(stated.example_numbers(file.text))
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
         notes.append(
@@ -61,19 +61,7 @@ def load_robot(config: RobotPart) -> RobotFile:
     runs = runs and all(c.inertia > 0 for _, c in robot.configurations.items())  # otherwise the model rejects it
     if resolves and runs and not capabilities.states_running_gear(robot):
         print_message("the robot's file has no running_gear: its wheelbase, belt and masses are examples")
-    return dataclasses.replace(file, robot=robot, remarks=unlike)
-
-
-def _unlike_sides_sentence(name: str, robot: Robot) -> Names:
-    """Sentence for straight travel on how a robot with different sides turns if both are driven equally."""
-    if not robot.unlike or not robot.has_ground:
-        return ()
-    if why := turn_error(robot, robot.configurations):
-        return (turn_words.unlike_sides_note(name, robot.unlike, f"turning cannot be computed: {why}"),)
-    value = capabilities.imposed_example(robot)
-    turn_rows = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
-    turns = turn_words.turn_under_equal_commands(robot, turn_rows, value)
-    return (turn_words.unlike_sides_note(name, robot.unlike, turns),) if turns else ()
+    return dataclasses.replace(file, robot=robot, stated=file.stated | {*config.set}, remarks=unlike)
 
 
 def posterior_beside_robot(file: RobotFile) -> Posterior:

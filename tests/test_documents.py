@@ -255,7 +255,7 @@ def test_a_long_table_is_cut_and_names_its_file(tmp_path, capsys):
 
 def test_the_page_of_check_draws_motor_and_gear(tmp_path):
     page = write_report_page(tmp_path, check()).read_text(encoding="utf-8")
-    assert drawn(page) == {"chart_of_corners", "drive_plane"}
+    assert drawn(page) == {"chart_of_corners"}
 
 
 def test_every_figure_of_the_catalogue_can_be_drawn():

@@ -159,7 +159,7 @@ def test_run_without_numbers_says_why(tmp_path):
 def test_operating_points_lie_on_the_chart_of_motor_and_gear(robot):
     """The chart is of a bench with a brake, the points are of the robot on a slope: one drive."""
     runs = _runs(("6T2A", "4W2T"), 33.0, 8.0, (0.0, 10.0))
-    points, curves = run_tables.operating_points(robot, runs), power_figures.drive_curves(robot, 33.0)
+    points, curves = run_tables.operating_points(robot, runs), run_tables.drive_curves(robot, [33.0])[33.0]
     assert (runs["status"] == "converged").all() and np.ptp(points["torque_Nm"]) > 1.0
     for name in ("motor_rpm", "motor_A"):
         on_curve = np.interp(points["torque_Nm"], curves["torque_Nm"], curves[name])

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities.steady import steady, steady_batch
+from mmrjax.fidelities.steady import steady
 from mmrjax.model import channels
-from mmrjax.model.conditions import OF_SIDES, Conditions
+from mmrjax.model.conditions import Conditions
 from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import Result
 
 #: Yaw rate below which a robot travels straight [rad/s]; a full turn would take two centuries.
 NONE = 1e-9
@@ -47,18 +45,6 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     point = steady(robot, conditions)
     radius = turning_radius(*(point.reading[name] for name in PLANE))
     return {"turning_radius": jnp.where(jnp.isnan(point.speed), jnp.nan, radius), "status": point.status}
-
-
-def turns_under_equal_commands(robot: Robot, imposed: float) -> Result:
-    """Settled turns on level ground of a robot with unequal sides under equal commands, one for each configuration.
-
-    Args:
-        imposed: voltage [V], or motor speed [rad/s] if its rig imposes that.
-    """
-    side_commands = OF_SIDES[-2:] if robot.rig.imposed == "motor_speed" else OF_SIDES[:2]
-    alike = dict.fromkeys(side_commands, imposed if robot.rig.imposed == "motor_speed" else 1.0)
-    equal_commands = Conditions([*robot.configurations], voltage=abs(imposed), **alike).resolved(robot)
-    return jax.device_get(steady_batch(robot, equal_commands))
 
 
 def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:

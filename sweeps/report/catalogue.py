@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
 from typing import Any
 
@@ -33,7 +33,13 @@ def text(name: str, *words: Any) -> str:
 
 
 def figure(
-    name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "", suffix: str = ""
+    name: str,
+    *drawn: Any,
+    finding: str = "",
+    words: Sequence[Any] = (),
+    more: str = "",
+    suffix: str = "",
+    values: Callable[[], Iterable[Any]] = tuple,
 ) -> Figure:
     """Figure of the catalogue. Its drawing function is imported late, because importing matplotlib takes half a
     second.
@@ -45,13 +51,14 @@ def figure(
         words: values to fill into the caption.
         more: text to append to the caption.
         suffix: name of the drawn quantity, if there are several figures with this name.
+        values: function that computes further arguments when the page is written.
     """
     entry = _entry(name)
     module, _, function = entry["draws"].rpartition(".")
     module = f"sweeps.{module}" if "." in module else f"sweeps.pages.{module}"
 
     def draw() -> Any:
-        return getattr(importlib.import_module(module), function)(*drawn)
+        return getattr(importlib.import_module(module), function)(*drawn, *values())
 
     return Figure(
         name.partition(".")[2] + f"_{suffix}" * bool(suffix),

@@ -21,7 +21,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
 from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Cell, Document, Note, Section, Table, columns
+from sweeps.report.document import Cell, Document, Figure, Note, Section, Table, columns
 
 #: Number of missed requirements that the statement names.
 NAMED = 3
@@ -128,16 +128,18 @@ SHOWN = 3
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
     """The report. `changes`: True if changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
-    robot, sections = found.robot, []
+    sections = []
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _blocks_of_changes(found), "changes"))
-    figures = [catalogue.figure("run.chart_of_corners", robot, [o.at for o in found.outcomes])]
-    if float(robot.gearbox.efficiency_load) < 1 or run_tables.lost_by_load(robot):
-        volts = float(robot.battery.cells * robot.battery.voltage_no_load(0.0))
-        figures.append(catalogue.figure("run.drive_plane", robot, volts, words=(volts,)))
-    sections.append(Section("Motor and gear", tuple(figures)))
+    sections.append(Section("Motor and gear", (_chart(found.robot, found.outcomes),)))
     blocks = Note(lead, "lead"), requirements_sheet(found.outcomes), catalogue.note("check.corners")
     return Document("Requirements", found.statement(), blocks, tuple(sections))
+
+
+def _chart(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> Figure:
+    """Chart of motor and gear with the worst corners."""
+    corners = [o.at for o in outcomes]
+    return catalogue.figure("run.chart_of_corners", values=lambda: run_tables.chart_of_corners(robot, corners))
 
 
 def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = True) -> Table:
@@ -288,8 +290,7 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
         Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
     ]
     if s.best is not None:
-        chart = catalogue.figure("run.chart_of_corners", s.best.robot, [o.at for o in found.outcomes])
-        sections.append(Section("Motor and gear", (chart,)))
+        sections.append(Section("Motor and gear", (_chart(s.best.robot, found.outcomes),)))
     return Document(
         "Sizing", found.statement(), (Note(lead, "lead"), *front), tuple(sections),
         brief=(lead, *next_best, *front_words),

@@ -96,7 +96,8 @@ def _figures(
     first, *others = [*laws, *curve, residuals]
     missing_term: list[Block] = [*laws[1:]]
     if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
-        missing_term.append(catalogue.figure("run.measured_drive_plane", found.robot, found.runs))
+        plane = lambda: run_tables.drive_plane(found.robot, found.runs)  # noqa: E731
+        missing_term.append(catalogue.figure("run.drive_plane", values=plane))
     sized = Layout.of(found.robot).crosses_zero
     closed = _closed(found, table) if sized else catalogue.text("loop.three")
     missing_term.append(catalogue.figure("loop.defects", table, verdict, sized, words=(closed,)))

@@ -119,13 +119,12 @@ def _parameter_section(file: RobotFile) -> Section:
     """Parameters of a rig, or those in which a robot differs from the nominal one."""
     from mmrjax.model.paper_robots import ROBOTS
 
+    name, values, rows = "own", ["value | .6g"], capabilities.rig_parameters(file)
     if file.robot.rig.inherits:
-        rows, name = capabilities.changed_parameters(file.robot, ROBOTS["nominal"]()), "changed"
-        titles = ("this robot | .6g", "nominal | .6g", "unit", "meaning")
-    else:
-        rows, name = capabilities.rig_parameters(file), "own"
-        titles = ("value | .6g", "unit", "meaning", "source")
-    table = Table(name, columns("parameter", *titles), [(f"`{name}`", *rest) for name, *rest in rows])
+        name, values = "changed", ["this robot | .6g", "nominal | .6g"]
+        rows = capabilities.changed_parameters(file.robot, ROBOTS["nominal"]())
+    heads = columns("parameter", *values, "unit", "meaning")
+    table = Table(name, heads, [(f"`{parameter}`", *rest) for parameter, *rest in rows])
     return Section("The robot", (catalogue.note(f"run.{name if rows else 'nominal'}"), table), "robot")
 
 

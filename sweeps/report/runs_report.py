@@ -204,8 +204,8 @@ def _power(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[Block]
     forward = settled & (supply > 0) & (runs["theoretical_speed_mm_s"] > 0)
     if forward.any() and robot.knows(VOLTAGE) and np.isfinite(runs["total_current_A"][forward]).all():
         points = run_tables.operating_points(robot, {key: value[forward] for key, value in runs.items()})
-        voltages = np.unique(supply[forward])[-3:].tolist()
-        yield catalogue.figure("run.drive_chart", robot, voltages, points)
+        curves = run_tables.drive_curves(robot, np.unique(supply[forward])[-3:].tolist())
+        yield catalogue.figure("run.drive_chart", robot, curves, points)
 
 
 def limits_used(robot: Robot, run: Json) -> list[Json]:

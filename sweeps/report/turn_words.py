@@ -15,13 +15,12 @@ from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
 from mmrjax.climbing import static_limits
 from mmrjax.climbing.resting_posture import SideOutline
-from mmrjax.derived.turning_figures import NONE
 from mmrjax.fidelities.simulation import STRAIGHT
 from mmrjax.model.channels import SIDES
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.quantities import MM
-from mmrjax.model.robot import Robot
-from mmrjax.model.signals import NOT_SETTLED, STATUSES, Result
+from mmrjax.model.robot import Robot, turn_error
+from mmrjax.model.signals import NOT_SETTLED, STATUSES
 from mmrjax.turning.two_sides import BETWEEN, OVER
 from sweeps.pages import words
 from sweeps.report.document import Table, columns
@@ -31,30 +30,13 @@ FULL = 2 * math.pi  # rad per turn
 STANDS, SPOT = 1.0, 1.0
 
 
-def unlike_sides_note(name: str, effects: Sequence[str], turns: str) -> str:
+def unlike_sides_note(name: str, robot: Robot) -> str:
     """Remark on effects that differ between the sides, which runs without a turn do not show."""
-    return f"{name}: {STRAIGHT} ({', '.join(effects)}); {turns}"
-
-
-def turn_under_equal_commands(robot: Robot, found: Result, value: float) -> str:
-    """Turn of a robot whose sides are driven equally, by configuration, in words. Empty if it travels straight.
-
-    Args:
-        value: imposed voltage or motor speed [V, rpm].
-    """
-    imposed, states = ("rpm", "motor_speed_left_rpm and motor_speed_right_rpm") if (
-        robot.rig.imposed == "motor_speed"
-    ) else ("V", "--left and --right, or duty_left and duty_right")  # fmt: skip
-    rates, speeds = (np.asarray(found.reading[channel]) for channel in ("yaw_rate", "speed"))
-    rates_by_configuration = zip(robot.configurations, rates, speeds, np.asarray(found.status), strict=True)
-    told = [
-        f"{name} {words.short_status(STATUSES[int(status)])}" if not math.isfinite(rate)
-        else f"{name} turns to the {SIDES[int(rate < 0)]} at {abs(rate):.3g} rad/s and {speed:.3g} m/s"
-        for name, rate, speed, status in rates_by_configuration
-        if not abs(rate) < NONE
-    ]  # fmt: skip
-    alike = f"with {value:g} {imposed} on both sides on level ground"
-    return f"{alike}, the robot does not travel straight: {', '.join(told)} ({states} show it)" if told else ""
+    of_speed = robot.rig.imposed == "motor_speed"
+    options = "motor_speed_left_rpm and motor_speed_right_rpm" if of_speed else "--left and --right"
+    why = turn_error(robot, robot.configurations)
+    turn = f"turning cannot be computed: {why}" if why else f"equal {options} show the turn"
+    return f"{name}: {STRAIGHT} ({', '.join(robot.unlike)}); {turn}"
 
 
 def has_motion(row: Json) -> bool:
