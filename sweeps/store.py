@@ -104,12 +104,13 @@ class Folder:
     config: RobotPart
     robot: Robot
     runs: Runs | None = None
-    #: Names that a finished folder may contain besides those of the manifest, if the process was killed while moving
-    #: it.
-    further: Names = (LOCK,)
+    #: Folder for files that a finished command does not need.
+    scratch: str
+    #: Names that a finished folder may contain besides those of the manifest.
+    further: Names = ()
 
-    def __init__(self, path: Path) -> None:
-        """Folder that will appear at `path`.
+    def __init__(self, path: Path, force: bool) -> None:
+        """Folder that will appear at `path`. `force`: True to replace a run folder there.
 
         Raises:
             BadConfiguration: the path is no name of a folder.
@@ -118,7 +119,8 @@ class Folder:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
         self.path, self.partial = path, path.with_name(path.name + ".partial")
         self.tables = "csv"
-        self._results_begun, self._digest = False, ""
+        self._results_begun, self._digest, self._force = False, "", force
+        self._lock: TextIO | None = None
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
@@ -139,7 +141,8 @@ class Folder:
         elif (file_names := listed_names(self.path)) is None:
             hint = "--force replaces only run folders"
         else:
-            foreign = sorted({p.name for p in self.path.iterdir()} - {*file_names, *self.further})
+            left_by_kill = (LOCK, self.scratch)  # of a process that was moving the folder
+            foreign = sorted({p.name for p in self.path.iterdir()} - {*file_names, *left_by_kill, *self.further})
             if not foreign:
                 return
             hint = f"--force would delete {foreign[0]}, which its command did not write"
@@ -172,16 +175,20 @@ class Folder:
                 "or --force to start again"
             )
 
-    def refuse_appeared(self, force: bool) -> None:
-        """Rejects a path that was created since the run began.
+    def _busy(self, share: str = "") -> BadConfiguration:
+        """Error on another process that uses the folder."""
+        of_share = f", share {share.replace('-', ' ')}" * bool(share)
+        return BadConfiguration(
+            f"--out: another process is using {self.partial}{of_share}; wait for it, or choose another path"
+        )
 
-        Raises:
-            OSError: it was. The partial folder is kept.
-        """
+    def _present(self) -> bool:
+        """True if the folder is still the one that this process opened, neither removed nor moved."""
+        assert self._lock is not None
         try:
-            self.refuse_taken(force)
-        except BadConfiguration:
-            raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path)) from None
+            return os.path.samestat(os.fstat(self._lock.fileno()), (self.partial / LOCK).stat())
+        except FileNotFoundError:
+            return False
 
     def _foreign(self) -> set[str]:
         """Names of foreign files in the partial folder.
@@ -270,8 +277,38 @@ class Folder:
         return self.move_into_place()
 
     def move_into_place(self) -> Path:
-        """Moves the finished folder to its final path."""
-        raise NotImplementedError
+        """Moves the finished folder to its final path and returns it.
+
+        The folder that it replaces is first moved into the new one and deleted there. If the process is killed
+        between two steps, the same command completes the rest.
+
+        Raises:
+            OSError: the path was created since the run began. The partial folder is kept.
+        """
+        try:
+            self.refuse_taken(self._force)
+        except BadConfiguration:
+            raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path)) from None
+        if self.path.is_dir():
+            replaced = self.partial / self.scratch / "replaced"
+            shutil.rmtree(replaced, ignore_errors=True)
+            os.replace(self.path, replaced)
+        os.replace(self.partial, self.path)
+        self._tidy()
+        return self.path
+
+    def _tidy(self) -> None:
+        """Deletes what a finished folder does not need. The lock is last: while it exists, something may be left."""
+        if (self.path / LOCK).is_file():
+            shutil.rmtree(self.path / self.scratch, ignore_errors=True)
+            (self.path / LOCK).unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Releases the lock, so that other processes can use the folder."""
+        if self._lock is not None:
+            with contextlib.suppress(OSError):  # the disk is full, which was reported
+                self._lock.close()
+            self._lock = None
 
 
 def listed_names(folder: Path) -> list[str] | None:
@@ -353,6 +390,8 @@ class RunFolder(Folder):
     `partial`. With `force`, another configuration starts again. Only one process at a time uses the folder.
     """
 
+    scratch = CHUNKS
+
     def __init__(self, path: Path, identity: Json, *, force: bool = False) -> None:
         """Creates or continues a run folder.
 
@@ -366,16 +405,15 @@ class RunFolder(Folder):
             BadConfiguration: `path` already exists or cannot be written, another process is using it, or another
                 command was interrupted there.
         """
-        super().__init__(path)
-        self._force, self.command = force, str(identity.get("command", ""))
-        self._digest = identity_digest(identity)
-        self._lock: TextIO | None = None
+        super().__init__(path, force)
+        self.command, self._digest = str(identity.get("command", "")), identity_digest(identity)
         self._taken_up = False
         self.refuse_taken(force)
         try:
-            while self._lock is None:
+            self.refuse_foreign(self.command, force)
+            while not self._enter():
+                self.close()
                 self.refuse_foreign(self.command, force)
-                self._lock = self._entered()
             self._begin_or_take_up()
         except BadConfiguration:
             self.close()
@@ -386,20 +424,13 @@ class RunFolder(Folder):
                 f"--out: {path} cannot be written ({error.strerror}); choose another path"
             ) from error
 
-    def _entered(self) -> TextIO | None:
-        """Lock of the partial folder. None if another process has removed or moved the folder meanwhile."""
+    def _enter(self) -> bool:
+        """Locks the partial folder. False if another process has removed or moved it meanwhile."""
         self.partial.mkdir(parents=True, exist_ok=True)
-        lock = (self.partial / LOCK).open("a+", encoding="utf-8")
-        if not try_to_lock(lock) or share_at_work(self.partial) is not None:
-            lock.close()
-            raise BadConfiguration(
-                f"--out: another process is using {self.partial}; wait for it, or choose another path"
-            )
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(lock.fileno()), (self.partial / LOCK).stat()):
-                return lock
-        lock.close()
-        return None
+        self._lock = (self.partial / LOCK).open("a+", encoding="utf-8")
+        if not try_to_lock(self._lock) or share_at_work(self.partial) is not None:
+            raise self._busy()
+        return self._present()
 
     def _begin_or_take_up(self) -> None:
         assert self._lock is not None
@@ -444,12 +475,6 @@ class RunFolder(Folder):
         self._remove_partial()
         self.close()
 
-    def close(self) -> None:
-        """Releases the lock, so that other processes can use the folder."""
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
-
     def chunk(self, name: str) -> Any:
         """Chunk from an interrupted run. None if missing or damaged, which is reported."""
         file = self._chunk_file(name)
@@ -481,22 +506,6 @@ class RunFolder(Folder):
 
     def _chunk_file(self, name: str) -> Path:
         return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}{ENDING}"
-
-    def move_into_place(self) -> Path:
-        """Deletes the chunks and moves the folder to its final path. The lock file is removed last.
-
-        Raises:
-            OSError: the path was created meanwhile. The partial folder is kept.
-        """
-        self.refuse_appeared(self._force)
-        shutil.rmtree(self.partial / CHUNKS)
-        if self.path.is_dir():
-            os.replace(self.path, self.partial / CHUNKS)
-            shutil.rmtree(self.partial / CHUNKS)
-        os.replace(self.partial, self.path)
-        (self.path / LOCK).unlink()
-        self.close()
-        return self.path
 
 
 def open_folder(

@@ -14,7 +14,7 @@ from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
 from sweeps.pages import figure_style, power_figures, sweep_figures
-from sweeps.report import page_renderer, run_tables
+from sweeps.report import drive_curves, page_renderer, run_tables
 from sweeps.report import runs_report as page
 from sweeps.report.document import Document, Section
 from tests.commands import with_columns
@@ -103,7 +103,7 @@ def test_a_chart_of_corners_does_not_warn_of_the_cut_off():
     robot = paper_robots.nominal()
     robot = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=2.5))
     corner = {"configuration": "4W2T", "payload_kg": 0.0, "slope_deg": 5.0, "state_of_charge": 0.5}
-    assert run_tables.chart_of_corners(robot, [corner])[2] is not None
+    assert drive_curves.chart_of_corners(robot, [corner])[2] is not None
 
 
 def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox(robot):
@@ -114,16 +114,16 @@ def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox(robot):
         np.array([-4.0, 4.0]),
         dataclasses.replace(robot, effects=(effects.BY_NAME["backdriving_loss"](amplitude=0.25),)),
     )
-    needs, loses = (run_tables.motor_torque(r, 24.0, load) for r in (robot, losing))
+    needs, loses = (drive_curves.motor_torque(r, 24.0, load) for r in (robot, losing))
     share = float(robot.gearbox.efficiency_load)
     assert_allclose(needs / load, [share, 1 / share], rtol=1e-4)
     assert_allclose(loses / load, [0.75 * share, 1 / share], rtol=1e-4)
-    assert_allclose(run_tables.motor_torque(robot, -24.0, load), -needs[::-1], rtol=1e-4)
+    assert_allclose(drive_curves.motor_torque(robot, -24.0, load), -needs[::-1], rtol=1e-4)
     runs = records.read_runs("measured")
     simulated = mm.simulate(losing, runs.conditions(losing))
     runs = with_columns(runs, total_current_A=np.asarray(simulated.total_current))
     with figure_style.figure_settings():
-        plane = power_figures.draw_drive_plane(*run_tables.drive_plane(losing, runs)).axes[0]
+        plane = power_figures.draw_drive_plane(*drive_curves.drive_plane(losing, runs)).axes[0]
     lines = {line.get_label(): line.get_xydata() for line in plane.lines}
     dots = lines["measured"][np.isfinite(lines["measured"]).all(1)]
     assert len(dots) > 10 and dots[:, 0].min() > 0

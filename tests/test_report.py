@@ -26,7 +26,7 @@ from mmrjax.model.signals import GRAVITY
 from sweeps.commands import compare
 from sweeps.pages import power_figures, words
 from sweeps.points import run
-from sweeps.report import comparison_report, page_renderer, run_tables, runs_report, sweep_report
+from sweeps.report import comparison_report, drive_curves, page_renderer, runs_report, sweep_report
 from sweeps.report.comparison_report import Comparison
 
 SWEEP_FIGURES = {f"sweep_{name}" for name in channels.USUAL}
@@ -159,7 +159,7 @@ def test_run_without_numbers_says_why(tmp_path):
 def test_operating_points_lie_on_the_chart_of_motor_and_gear(robot):
     """The chart is of a bench with a brake, the points are of the robot on a slope: one drive."""
     runs = _runs(("6T2A", "4W2T"), 33.0, 8.0, (0.0, 10.0))
-    points, curves = run_tables.operating_points(robot, runs), run_tables.drive_curves(robot, [33.0])[33.0]
+    points, curves = drive_curves.operating_points(robot, runs), drive_curves.drive_curves(robot, [33.0])[33.0]
     assert (runs["status"] == "converged").all() and np.ptp(points["torque_Nm"]) > 1.0
     for name in ("motor_rpm", "motor_A"):
         on_curve = np.interp(points["torque_Nm"], curves["torque_Nm"], curves[name])

@@ -707,17 +707,17 @@ MORE_NAMES = {
     "sweeps/commands/simulate.py": 36,
     "sweeps/commands/sweep.py": 49,
     "sweeps/commands/turn.py": 27,
-    "sweeps/inputs.py": 39,
+    "sweeps/inputs.py": 36,
     # Reports, stores and exports show every part of a result.
     "sweeps/paper/report.py": 32,
     "sweeps/points/axes.py": 27,
-    "sweeps/points/run.py": 37,
+    "sweeps/points/run.py": 36,
     "sweeps/points/tasks.py": 33,
     "sweeps/points/zarr_store.py": 29,
     "sweeps/report/loop_report.py": 29,
-    "sweeps/report/mission_report.py": 30,
+    "sweeps/report/mission_report.py": 28,
     "sweeps/report/runs_report.py": 29,
-    "sweeps/report/sweep_report.py": 27,
+    "sweeps/report/sweep_report.py": 26,
 }
 
 

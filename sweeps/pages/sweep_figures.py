@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps, colors
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -151,7 +150,7 @@ ENDINGS = (GREEN, VERMILION, ORANGE, SKY, PURPLE, FAINT, INK)
 
 
 def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, VariedQuantity]) -> Figure:
-    """Histogram of an output, its median against the two quantities that it depends on most, and against both.
+    """Histogram of an output, and its median against the two quantities that it depends on most.
 
     Args:
         output: output of the points that settled.
@@ -159,18 +158,17 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
         varied: varied quantities by name, at these points.
     """
     most = sorted(varied.values(), key=lambda quantity: -variance_share(quantity.values, output))[:2]
-    fig, ((histogram, *others),) = new_figure(1, 2 + len(most) if len(most) == 2 else 2, 2.9)
+    fig, ((histogram, *others),) = new_figure(1, 1 + len(most), 2.9)
     histogram.hist(output, bins=_number_of_bins(output, BARS), color=BLUE)
     histogram.set(xlabel=label, ylabel="points", title="distribution")
-    for axes, quantity in zip(others, most, strict=False):
+    for axes, quantity in zip(others, most, strict=True):
         bin_index, middles = bin_values(quantity.values)
         quantiles = np.array([np.quantile(output[bin_index == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
         axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
         axes.plot(middles, quantiles[:, 1], color=BLUE)
-        axes.set_ylabel(label)
-        _label_axis(axes.xaxis, quantity)
-    if len(most) == 2:
-        _draw_output_map(fig, others[2], most[0], most[1], output, label)
+        axes.set(xlabel=quantity.label, ylabel=label)
+        if quantity.words:
+            axes.set_xticks(range(len(quantity.words)), list(quantity.words))
     return fig
 
 
@@ -219,24 +217,3 @@ def variance_share(values: np.ndarray, output: np.ndarray) -> float:
     mean = np.bincount(bin_index, output, minlength=len(middles)) / np.maximum(count, 1)
     total = float(np.var(output))
     return float(np.sum(count * (mean - output.mean()) ** 2) / len(output) / total) if total > 0 else 0.0
-
-
-def _label_axis(axis: Axis, varied: VariedQuantity) -> None:
-    axis.set_label_text(varied.label)
-    if varied.words:
-        axis.set_ticks(range(len(varied.words)), labels=list(varied.words))
-
-
-def _draw_output_map(
-    fig: Figure, axes: Axes, one: VariedQuantity, other: VariedQuantity, output: np.ndarray, label: str
-) -> None:
-    from scipy.stats import binned_statistic_2d
-
-    (a, across), (b, along) = bin_values(one.values), bin_values(other.values)
-    edges = [np.arange(len(middles) + 1) - 0.5 for middles in (along, across)]
-    cells = binned_statistic_2d(b, a, output, "median", edges).statistic
-    mesh = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
-    fig.colorbar(mesh, ax=axes, label=f"median {label}")
-    _label_axis(axes.xaxis, one)
-    _label_axis(axes.yaxis, other)
-    axes.grid(False)

@@ -15,7 +15,6 @@ import json
 import math
 import os
 import platform
-import shutil
 import tempfile
 import warnings
 import zlib
@@ -185,7 +184,8 @@ class Done:
 class SweepStore(Folder):
     """Folder of a sweep, named `path` + `.partial` until it is complete, shared by the processes of a job array."""
 
-    further = (LOCK, ASIDE, "runs.csv", "runs.parquet")
+    scratch = ASIDE
+    further = ("runs.csv", "runs.parquet")
 
     def __init__(self, path: Path, identity: Identity, layout: StoreLayout, *, force: bool = False) -> None:
         """Creates a store, or continues one with the same identity.
@@ -195,13 +195,11 @@ class SweepStore(Folder):
                 differences), or another process is working on what `force` would replace.
             BadData: the sweep is finished but a file of its store is damaged.
         """
-        super().__init__(path)
+        super().__init__(path, force)
         self.layout = layout
         self.finished = False
-        self._force = force
         self._journal: TextIO | None = None
         self._share: Path | None = None
-        self._lock: TextIO | None = None
         self._identity = identity
         self._aside = self.partial / ASIDE / "identity"
         self._sound: dict[int, Done] = {}
@@ -230,7 +228,7 @@ class SweepStore(Folder):
             ) from error
         mark = interrupted_run(self.partial)
         if mark is not None and mark["command"] not in ("", COMMAND) and not try_to_lock(self._lock):
-            raise self._busy("")
+            raise self._busy()
         with self._locked():
             if not self._present():
                 return self._finished_by_another(force)
@@ -239,14 +237,6 @@ class SweepStore(Folder):
 
     def _is_finished(self) -> bool:
         return listed_names(self.path) is not None and (self.path / IDENTITY).is_file()
-
-    def _present(self) -> bool:
-        """True if the folder is still the one that this process opened, neither removed nor moved."""
-        assert self._lock is not None
-        try:
-            return os.path.samestat(os.fstat(self._lock.fileno()), (self.partial / LOCK).stat())
-        except FileNotFoundError:
-            return False
 
     def _finished_by_another(self, force: bool = False) -> bool:
         if not self._is_finished() or (force and self._differs(self.path)):
@@ -377,12 +367,6 @@ class SweepStore(Folder):
             self._journal.write("\n")
             self._journal.flush()
 
-    def _busy(self, name: str) -> BadConfiguration:
-        share = f", share {name.replace('-', ' ')}" * bool(name)
-        return BadConfiguration(
-            f"--out: another process is using {self.partial}{share}; wait for it, or choose another path"
-        )
-
     def done(self) -> dict[int, Done]:
         """Finished chunks with undamaged files, by number. Each damaged chunk is reported once."""
         for chunk, records in self._records().items():
@@ -483,34 +467,18 @@ class SweepStore(Folder):
             yield not self.finished and len(self.done()) == len(self.layout.blocks)
 
     def move_into_place(self) -> Path:
-        """Moves the finished folder to its final path and returns it. Call within `last`.
-
-        The folder that it replaces is first moved into the new one and deleted there. If the process is killed
-        between two steps, the same command completes the rest.
-        """
-        self.refuse_appeared(self._force)
-        if self.path.is_dir():
-            replaced = self.partial / ASIDE / "replaced"
-            shutil.rmtree(replaced, ignore_errors=True)
-            os.replace(self.path, replaced)
-        os.replace(self.partial, self.path)
+        """As of every folder. Call within `last`."""
+        path = super().move_into_place()
         self.finished = True
-        self._tidy()
-        return self.path
-
-    def _tidy(self) -> None:
-        """Deletes what a finished folder does not need. The lock is last: while it exists, something may be left."""
-        if (self.path / LOCK).is_file():
-            shutil.rmtree(self.path / ASIDE, ignore_errors=True)
-            (self.path / LOCK).unlink(missing_ok=True)
+        return path
 
     def close(self) -> None:
-        """Releases the lock, so that other processes can continue."""
-        for file in (self._journal, self._lock):
-            if file is not None:
-                with contextlib.suppress(OSError):  # the disk is full, which was reported
-                    file.close()
-        self._journal = self._share = self._lock = None
+        """Releases all locks, so that other processes can continue."""
+        if self._journal is not None:
+            with contextlib.suppress(OSError):  # the disk is full, which was reported
+                self._journal.close()
+        self._journal = self._share = None
+        super().close()
 
     def abandon(self) -> None:
         """Removes the store if this process created it, no chunk is done, and no other process is working on it."""

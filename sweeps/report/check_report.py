@@ -20,7 +20,7 @@ from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
 from sweeps.pages import words
-from sweeps.report import catalogue, run_tables
+from sweeps.report import catalogue, drive_curves
 from sweeps.report.document import Cell, Document, Figure, Note, Section, Table, columns
 
 #: Number of missed requirements that the statement names.
@@ -139,7 +139,7 @@ def check_document(found: CheckResult, robot_name: str, changes: bool = True) ->
 def _chart(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> Figure:
     """Chart of motor and gear with the worst corners."""
     corners = [o.at for o in outcomes]
-    return catalogue.figure("run.chart_of_corners", values=lambda: run_tables.chart_of_corners(robot, corners))
+    return catalogue.figure("run.chart_of_corners", values=lambda: drive_curves.chart_of_corners(robot, corners))
 
 
 def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = True) -> Table:

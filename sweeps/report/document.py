@@ -211,6 +211,11 @@ class Section:
     level: int = 2
     folded: str = ""
 
+    @property
+    def anchor(self) -> str:
+        """Name of the heading's element, by default from its words."""
+        return self.name or "section-" + re.sub(r"\W+", "-", self.heading.lower()).strip("-")
+
 
 @dataclasses.dataclass(frozen=True)
 class Document:

@@ -21,9 +21,8 @@ from mmrjax.effects import BY_NAME
 from mmrjax.errors import count_noun
 from mmrjax.model import params
 from sweeps.pages import words
-from sweeps.report import catalogue, fit_tables, run_tables
+from sweeps.report import catalogue, drive_curves, fit_tables, run_tables
 from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table, remarks
-from sweeps.report.fit_tables import Change
 
 #: Smallest change of an rms error that is marked [%].
 NOTABLE = 0.05
@@ -31,7 +30,7 @@ NOTABLE = 0.05
 MOVED = 2.0
 
 
-def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str, Change]) -> Document:
+def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str, fit_tables.Change]) -> Document:
     """Report of a loop.
 
     Args:
@@ -59,7 +58,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
 
 
 def _figures(
-    found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]
+    found: DiscoveryResult, table: Columns, changes: Mapping[str, fit_tables.Change]
 ) -> tuple[Figure, list[Block], list[Block]]:
     """First figure of the page, blocks that show every run, and blocks that show the missing term.
 
@@ -95,8 +94,8 @@ def _figures(
     residuals = catalogue.figure("loop.before_after", table, found.channels, verdict)
     first, *others = [*laws, *curve, residuals]
     missing_term: list[Block] = [*laws[1:]]
-    if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
-        plane = lambda: run_tables.drive_plane(found.robot, found.runs)  # noqa: E731
+    if drive_curves.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
+        plane = lambda: drive_curves.drive_plane(found.robot, found.runs)  # noqa: E731
         missing_term.append(catalogue.figure("run.drive_plane", values=plane))
     sized = Layout.of(found.robot).crosses_zero
     closed = _closed(found, table) if sized else catalogue.text("loop.three")
@@ -122,7 +121,7 @@ def rows_for_figures(found: DiscoveryResult) -> Columns:
     return table
 
 
-def _effect_findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable[str]:
+def _effect_findings(found: DiscoveryResult, changes: Mapping[str, fit_tables.Change]) -> Iterable[str]:
     """Sentences on the effects found: meaning, size, certainty and alternatives."""
     for e in found.effects:
         size, other = loop_words.effect_amplitude(e), loop_words.indistinguishable_effects(found, e)

@@ -33,7 +33,7 @@ from sweeps.report.document import SIDE_BY_SIDE, Document, Figure, Note, Section
 def write_report_page(folder: Path, document: Document, file: RobotFile | None = None) -> Path:
     """Writes `report.html` and `figures/` of a document. Returns the path of the page.
 
-    Adds the parts of every page: contents after the answer, files of the folder, tables that scroll.
+    Adds the parts of every page: contents after the answer, and files of the folder.
 
     Args:
         file: robot file of the page, whose parameters are the last section.
@@ -58,19 +58,6 @@ def write_report_page(folder: Path, document: Document, file: RobotFile | None =
         warnings=() if file is None else robot_warnings(file),
         about_robot=None if file is None else _parameter_section(file),
     )  # fmt: skip
-    page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
-    # Adds links to the headings before the first heading
-    links = []
-
-    def with_id(found: re.Match[str]) -> str:
-        text = re.sub("<.*?>", "", found[2])
-        name = found[1] or "section-" + re.sub(r"\W+", "-", text.lower()).strip("-")
-        links.append(f'<a href="#{name}">{text}</a>')
-        return f'<h2 id="{name}">{found[2]}</h2>'
-
-    page = re.sub(r"<h2(?: id=\"([^\"]+)\")?>(.*?)</h2>", with_id, page, flags=re.S)
-    begin = page.index("<h2")
-    page = f'{page[:begin]}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[begin:]}'
     path = Path(folder) / "report.html"
     write_text(path, printable(page))
     return path

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -14,18 +13,11 @@ import numpy as np
 from calibration.data import Columns, Json
 from calibration.data.columns import IMPOSED
 from calibration.data.robot_file import RobotFile
-from calibration.data.table import Runs
 from mmrjax import effects
-from mmrjax.fidelities.outputs import output_columns
-from mmrjax.fidelities.results import Results
-from mmrjax.fidelities.simulation import simulate
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
-from mmrjax.model.conditions import Conditions
-from mmrjax.model.quantities import RPM, SET, TABLE, Condition
-from mmrjax.model.robot import Configurations, Robot
-from mmrjax.model.shaft import Shaft
-from mmrjax.model.signals import is_done
+from mmrjax.model.quantities import SET, TABLE, Condition
+from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.capabilities import UNLIMITED
 from sweeps.pages import words
@@ -143,11 +135,6 @@ def note_on_robot(file: RobotFile, model: str = "", more: str = "") -> Note:
     return Note(" ".join(filter(None, parts)), "lead")
 
 
-def lost_by_load(robot: Robot) -> bool:
-    """True if an effect of the robot loses a share of the load in the gearbox."""
-    return any(e.balance == "gearbox" and e.driver == "load" for e in robot.effects)
-
-
 def curve_warning(robot: Robot) -> tuple[Note, ...]:
     """Warning if the robot has curves for unexplained discrepancies."""
     names = " and ".join(f"`{e.name}`" for e in robot.effects if e.name in effects.UNNAMED)
@@ -181,109 +168,6 @@ def endings_table(
         for s in reached
     ]  # fmt: skip
     return Table("statuses", heads, rows)
-
-
-def operating_points(robot: Robot, runs: Columns) -> Columns:
-    """Torque at the gearbox output, speed and current of one motor in settled runs, from columns of `runs.csv`.
-
-    The current is left out if it is imposed.
-    """
-    radius = np.array([float(robot.configurations[name].radius) for name in runs["configuration"]])
-    output = runs["theoretical_speed_mm_s"] / 1e3 / radius
-    with np.errstate(divide="ignore", invalid="ignore"):
-        torque = runs["power_gear_W"] / float(robot.sides) / output
-    speed = output * float(robot.gearbox.ratio) / RPM
-    points = {"torque_Nm": torque, "motor_rpm": speed}
-    if "total_current_A" in runs:
-        points["motor_A"] = runs["total_current_A"] / float(robot.sides)
-    return points
-
-
-#: Loads of a drive curve, and balances whose effects it includes.
-LOADS = 60
-INSIDE = ("duty", "supply", "electrical", "motor", "gearbox")
-
-
-def _runs_on_a_shaft(robot: Robot, voltage: float, load: np.ndarray) -> tuple[Results, np.ndarray]:
-    """Steady runs of the robot's drive with a frictionless shaft as its load, and True for those that turn forward.
-
-    Args:
-        load: torques of the load [N·m].
-    """
-    shaft = Configurations({"shaft": Shaft(inertia=1e-3, loss_coulomb=0.0)})
-    inside = tuple(e for e in robot.effects if e.balance in INSIDE and e.acts_everywhere)
-    drive = dataclasses.replace(robot, configurations=shaft, effects=inside)
-    runs = simulate(drive, Conditions(0, voltage, load_torque=load))
-    return runs, np.asarray(is_done(np.asarray(runs.status))) & (np.asarray(runs.motor_speed) * voltage > 0)
-
-
-def drive_curves(robot: Robot, voltages: Iterable[float]) -> dict[float, Columns]:
-    """Torque at the gearbox output, speed, current and efficiency of one motor and gear, from no load to the current
-    limit or to stall, by supply voltage, the highest first.
-    """
-    motor, ratio, curves = robot.motor, float(robot.gearbox.ratio), {}
-    for voltage in sorted(voltages, reverse=True):
-        current = min(float(motor.current_stall(voltage)), float(robot.driver.current_limit))
-        torque = np.linspace(0, 1, LOADS, endpoint=False) ** 2 * float(motor.torque_constant) * ratio * current
-        runs, settled = _runs_on_a_shaft(robot, voltage, torque)
-        speed, drawn = np.asarray(runs.motor_speed), np.asarray(runs.total_current) / float(robot.sides)
-        efficiency = 100 * torque * speed / ratio / np.maximum(voltage * drawn, 1e-9)
-        curve = {"torque_Nm": torque, "motor_rpm": speed / RPM, "motor_A": drawn, "efficiency_percent": efficiency}
-        curves[voltage] = {name: values[settled] for name, values in curve.items()}
-    return curves
-
-
-def chart_of_corners(robot: Robot, corners: Sequence[Json]) -> tuple[Robot, dict[float, Columns], Columns | None]:
-    """Arguments of the chart of motor and gear at corners of an envelope, on the robot's own ground."""
-    keys = ("configuration", "payload_kg", "slope_deg", "state_of_charge", "supply_voltage_V")
-    cells = [tuple(corner.get(key) for key in keys) for corner in corners]
-    rows = dict.fromkeys(
-        cell for cell in cells if None not in cell[:3] and not any(isinstance(x, list | tuple) for x in cell)
-    )
-    full, points = float(robot.battery.cells * robot.battery.voltage_no_load(0.0)), None
-    supply = np.array([full if volts is None else volts for *_, volts in rows] or [full])
-    if rows:
-        names, payload, slope, charge, volts = zip(*rows, strict=True)
-        on_battery = np.array([v is None for v in volts])
-        used = float(robot.battery.capacity) * np.array([0.0 if c is None else 1 - max(c, 1e-9) for c in charge])
-        conditions = Conditions(
-            list(names), supply, slope_deg=np.array(slope), payload=np.array(payload),
-            battery=on_battery.astype(float), discharge=on_battery * used,
-        )  # fmt: skip
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a cut-off that rarely acts
-            runs = simulate(robot, conditions)
-        done = np.asarray(is_done(np.asarray(runs.status)))
-        columns = {"configuration": np.array(names), **output_columns(runs.result, robot.channels)}
-        points = operating_points(robot, {name: values[done] for name, values in columns.items()})
-    return robot, drive_curves(robot, sorted(set(supply.tolist()))[-3:]), points
-
-
-def drive_plane(robot: Robot, runs: Runs) -> tuple[Columns, Columns]:
-    """Torques at the gearbox [N·m]: of the load and of the motor each way, at the voltage of the fastest run, and of
-    settled runs, from the simulated load and the measured current.
-    """
-    results = simulate(robot, runs.conditions(robot))
-    speed, ratio, sides = np.asarray(results.motor_speed), float(robot.gearbox.ratio), float(robot.sides)
-    channel = next(c for c in robot.channels if c.name in ("motor_current", "total_current"))
-    motors = sides if channel.name == "total_current" else 1.0
-    beyond = (runs[channel.column] * channel.factor - np.asarray(getattr(results, channel.name))) / motors
-    with np.errstate(divide="ignore", invalid="ignore"):
-        simulated = ratio * np.asarray(results.power_motor) / sides / speed
-    measured = simulated + ratio * float(robot.motor.torque_constant) * beyond
-    most, voltage = np.nanmax(np.abs(simulated)), float(np.nanmax(np.abs(runs["supply_voltage_V"])))
-    load = np.linspace(-most, most, 2 * LOADS + 1)
-    forward, backward = (motor_torque(robot, volts, load) for volts in (voltage, -voltage))
-    at_load = [np.interp(simulated, way, load) for way in (forward, backward)]
-    points = {"load": np.where(speed > 0, *at_load), "motor": measured}
-    return {"load": load, "forward": forward, "backward": backward}, points
-
-
-def motor_torque(robot: Robot, voltage: float, load: np.ndarray) -> np.ndarray:
-    """Torque of a motor at the gearbox input, times the ratio [N·m], for each torque of the load. NaN at rest."""
-    runs, moves = _runs_on_a_shaft(robot, voltage, load)
-    speed = np.where(moves, np.asarray(runs.motor_speed), np.nan)
-    return np.asarray(float(robot.gearbox.ratio) * np.asarray(runs.power_motor) / float(robot.sides) / speed)
 
 
 def limits_table(limits: Sequence[Json], what: str) -> Table:

@@ -17,9 +17,8 @@ from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.report import catalogue, run_tables, turn_words
+from sweeps.report import catalogue, drive_curves, run_tables, turn_words
 from sweeps.report.document import SIDE_BY_SIDE, Block, Column, Document, Note, Section, Table, remarks
-from sweeps.report.run_tables import imposed_column
 from sweeps.report.turn_words import Postures
 
 #: Column of the largest total motor current in a run over time.
@@ -62,7 +61,7 @@ def runs_document(
         blocks.append(run_tables.endings_table(Counter(map(str, runs["status"]))))
     blocks += remarks([*notes, *([] if stands is None else [turn_words.posture_sentences(stands)])])
     shown_table = run_tables.quantity_table(
-        "runs", table, (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER),
+        "runs", table, (run_tables.imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER),
         first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE, sideways=True,
     )  # fmt: skip
 
@@ -70,8 +69,7 @@ def runs_document(
         if histories is not None:
             yield from _histories(robot, runs, names, histories)
         if stands is not None:
-            posture = catalogue.figure("runs.posture", stands), turn_words.posture_table(stands, names)
-            yield Section("Posture", posture, "posture-section")
+            yield Section("Posture", (catalogue.figure("runs.posture", stands),), "posture-section")
         yield Section("Where the power goes", tuple(_power(robot, runs, names)), "chain")
 
     of_runs = Section("The run" if single else "The runs", (shown_table,), "runs-section")
@@ -203,15 +201,15 @@ def _power(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[Block]
     supply = runs.get("supply_voltage_V", np.full(len(names), np.nan))
     forward = settled & (supply > 0) & (runs["theoretical_speed_mm_s"] > 0)
     if forward.any() and robot.knows(VOLTAGE) and np.isfinite(runs["total_current_A"][forward]).all():
-        points = run_tables.operating_points(robot, {key: value[forward] for key, value in runs.items()})
-        curves = run_tables.drive_curves(robot, np.unique(supply[forward])[-3:].tolist())
+        points = drive_curves.operating_points(robot, {key: value[forward] for key, value in runs.items()})
+        curves = drive_curves.drive_curves(robot, np.unique(supply[forward])[-3:].tolist())
         yield catalogue.figure("run.drive_chart", robot, curves, points)
 
 
 def limits_used(robot: Robot, run: Json) -> list[Json]:
     """Use of each limit by a run. The inrush current has no share if its limit is not stated."""
     idle = capabilities.inapplicable_columns(robot)
-    point = run_tables.operating_points(robot, {name: np.atleast_1d(x) for name, x in run.items()})
+    point = drive_curves.operating_points(robot, {name: np.atleast_1d(x) for name, x in run.items()})
     shaft, torque = float(point["motor_rpm"][0]), float(point["torque_Nm"][0])
     cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: no supply
     gear = f"gearbox torque at {'the driving wheel' if robot.has_ground else 'its output'}"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 import jax
 import numpy as np
@@ -23,7 +22,6 @@ from mmrjax.model.robot import Robot, turn_error
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
 from mmrjax.turning.two_sides import BETWEEN, OVER
 from sweeps.pages import words
-from sweeps.report.document import Table, columns
 
 FULL = 2 * math.pi  # rad per turn
 #: Speed below which a motor stands [rpm], and below which a robot turns on the spot [mm/s].
@@ -182,30 +180,8 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
     return Postures(table, level, Drawn(step.side, float(step.base), float(step.height)), best)
 
 
-#: Columns of the page's table.
-COLUMNS = {
-    "levers_front_deg": "front levers [°] | g", "levers_rear_deg": "rear levers [°] | g",
-    "pitch_deg": "pitch [°] | .1f", "contact_mm": "contact [mm] | .0f", "bears": "bears |",
-    "load_front_percent": "load at the front [%] | .0f",
-    "centre_height_mm": "centre of mass over the ground [mm] | .1f", "margin_mm": "margin [mm] | .0f",
-    "tips_back_deg": "tips back on [°] | .1f", "tips_forward_deg": "tips forward on [°] | .1f",
-    "tips_aside_deg": "tips aside on [°] | .1f", "highest_step_mm": "highest step [mm] | .0f",
-    "widest_gap_mm": "widest gap [mm] | .0f", "tip_front_mm": "front tip up to [mm] | .0f",
-    "tip_rear_mm": "rear tip up to [mm] | .0f", "overall_length_mm": "length [mm] | .0f",
-    "overall_height_mm": "height [mm] | .0f",
-}  # fmt: skip
-#: Most rows of that table.
+#: Most runs that a remark names.
 ROWS = 20
-
-
-def posture_table(found: Postures, names: Sequence[str]) -> Table:
-    """Postures of the first runs, one row for each."""
-    cells: dict[str, Any] = {
-        "run": names,
-        **{title: found.table[c] for c, title in COLUMNS.items() if c in found.table},
-    }
-    rows = list(zip(*(values[:ROWS] for values in cells.values()), strict=True))
-    return Table("posture", columns(*cells), rows, file="posture.csv", sideways=True)
 
 
 def posture_sentences(found: Postures) -> str:
