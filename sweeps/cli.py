@@ -672,7 +672,7 @@ def _report_failure(error: BaseException) -> int:
             "loop": "after the last complete stage",
         }
         resumed = [kept[command] for command in sys.argv[1:2] if command in kept]
-        advice = f"the same command and --out resume {resumed[0]}" if resumed else "no run folder was written"
+        advice = f"the same command with --out continues {resumed[0]}" if resumed else "no run folder was written"
         return _print_failure(f"interrupted; {advice}", INTERRUPTED)
     if _memory_exhausted(error):
         return _print_failure("out of memory; use a smaller --chunk, fewer rows, or more memory", 2)

@@ -87,14 +87,14 @@ class Part(BaseModel):
         parts = [vars(part) for part in type(self).__mro__]
         for one, other, text in (rule for part in parts for rule in part.get("needed", ())):
             if self.states(one) and not self.states(other):
-                raise idle(f"`{one}` {text}")
+                raise combination_error(f"`{one}` {text}")
         for one, other, *more in (rule for part in parts for rule in part.get("exclusive", ())):
             if self.states(one) and self.states(other):
-                raise idle(f"`{one}` cannot be combined with `{other}`{''.join(more)}")
+                raise combination_error(f"`{one}` cannot be combined with `{other}`{''.join(more)}")
         return self
 
 
-def idle(message: str) -> PydanticCustomError:
+def combination_error(message: str) -> PydanticCustomError:
     """Error on the combination of several fields, whose names are between backticks."""
     return PydanticCustomError("idle", message)
 
@@ -216,10 +216,10 @@ class FidelityPart(ModelPart):
             if value is None:
                 continue
             if self.model not in having and value not in {option.default for option in having.values()}:
-                raise idle(f"`{name}_s` has an effect only with `model` {_join_with_or(having)}")
+                raise combination_error(f"`{name}_s` has an effect only with `model` {_join_with_or(having)}")
             if self.model in having and value > having[self.model].most:
                 most = f"{having[self.model].most:g} {having[self.model].unit}"
-                raise idle(f"`{name}_s`: got {value:g}; `model` {self.model} allows at most {most}")
+                raise combination_error(f"`{name}_s`: got {value:g}; `model` {self.model} allows at most {most}")
         return self
 
     @property
@@ -304,7 +304,7 @@ class GivenRuns(OneRun, FolderPart):
     def _once(self) -> Self:
         if self.runs is not None and self.stated:
             names = ", ".join(f"`{name}`" for name in self.stated)
-            raise idle(f"{names}: not allowed with `runs`; give it as a column there")
+            raise combination_error(f"{names}: not allowed with `runs`; give it as a column there")
         return self
 
 
@@ -448,7 +448,7 @@ class ProfilePart(FidelityPart):
     @model_validator(mode="after")
     def _profiled(self) -> Self:
         if self.profile is not None and self.model != PROFILED:
-            raise idle(f"`profile` has an effect only with `model` {PROFILED}; got {self.model}")
+            raise combination_error(f"`profile` has an effect only with `model` {PROFILED}; got {self.model}")
         return self
 
     @property
@@ -569,13 +569,15 @@ class Climb(RobotPart, ConfigurationPart, ClimbPart, SupplyPart, OutputPart):
     def _one_obstacle(self) -> Self:
         stated = next((name for name in ("step_mm", "stairs", "gap_mm", "terrain") if self.states(name)), None)
         if stated is None and self.find is None:
-            raise idle("no obstacle is given; give `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`")
+            raise combination_error(
+                "no obstacle is given; give `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`"
+            )
         if self.find == "stairs" and stated is None:
-            raise idle("`find` stairs needs `stairs`, which sets tread and count")
+            raise combination_error("`find` stairs needs `stairs`, which sets tread and count")
         if self.find is not None and stated is not None and not stated.startswith(self.find):
-            raise idle(f"`find` {self.find} cannot be combined with `{stated}`")
+            raise combination_error(f"`find` {self.find} cannot be combined with `{stated}`")
         if self.nose_mm and (stated in ("gap_mm", "terrain") or self.find == "gap"):
-            raise idle("`nose_mm` has an effect only with steps and stairs")
+            raise combination_error("`nose_mm` has an effect only with steps and stairs")
         return self
 
 

@@ -20,7 +20,7 @@ from sweeps.config import (
     ProfilePart,
     RobotPart,
     Sweep,
-    idle,
+    combination_error,
     option_field,
     read_toml,
     resolve_configuration,
@@ -54,7 +54,7 @@ class Obstacle(ClimbPart):
     def _of_its_kind(self) -> Self:
         for name, kinds in {"tread_mm": ("stairs",), "count": ("stairs",), "nose_mm": ("step", "stairs")}.items():
             if self.states(name) and self.kind not in kinds:
-                raise idle(f"`{name}` has an effect only with `kind` {' or '.join(kinds)}")
+                raise combination_error(f"`{name}` has an effect only with `kind` {' or '.join(kinds)}")
         return self
 
 
@@ -96,7 +96,7 @@ class StoreOptions(FolderPart):
     @model_validator(mode="after")
     def _shared(self) -> Self:
         if not 1 <= self.share[0] <= self.share[1]:
-            raise idle(f"`shard`: got {self.shard}; expected i/n with i from 1 to n, such as 3/8")
+            raise combination_error(f"`shard`: got {self.shard}; expected i/n with i from 1 to n, such as 3/8")
         return self
 
     @property

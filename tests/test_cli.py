@@ -125,7 +125,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
         return honest(compiled, values, *told)
 
     monkeypatch.setattr(Compiled, "__call__", interrupted)
-    ends(mmrjax(f"{arguments} --chunk 10 --out s"), "resume after the last complete chunk", code=130)
+    ends(mmrjax(f"{arguments} --chunk 10 --out s"), "with --out continues after the last complete chunk", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
     kept = len(list((tmp_path / "s.partial/chunks").glob("*.stage")))
     assert 0 < kept <= 3

@@ -45,7 +45,7 @@ ROWS = 8192
 #: Number of choices whose best random design is refined with three points along each axis, and number of designs that
 #: are refined after that, with any ratio and fractions of a cell. Points along each axis, rounds, and shrinkage of
 #: the box per round.
-COARSE, REFINED, ALONG, ROUNDS, SHRINK = 300, 24, 7, 7, 0.45
+COARSE, REFINED, POINTS_PER_AXIS, ROUNDS, SHRINK = 300, 24, 7, 7, 0.45
 #: Half width of the first box [ratio of each number, logarithm].
 WIDTH = 0.25
 #: Number of choices whose data-sheet ratios are all tried with whole cells, most parallel cells, and number of
@@ -245,7 +245,7 @@ def size_robot(
     weights = np.outer(1 - shares, first) + np.outer(shares, np.eye(len(OBJECTIVES))[columns[-1]])
     best = np.concatenate([best_of(tried, KEPT_WHOLE, w) for w in weights])
     of_best = np.repeat(weights, len(best) // len(weights), axis=0)
-    buildable = refined(tried.part(best), of_best, ("radius",), ALONG)
+    buildable = refined(tried.part(best), of_best, ("radius",), POINTS_PER_AXIS)
     tell(progress_remark("refined", REFINED))
     by_cost = best_of(drawn, len(drawn.rows), first)
     motors_of_choices = np.array([part_options.drives[k].motor.name for k in choice.drive])
@@ -253,7 +253,7 @@ def size_robot(
     of_motors = np.unique(motors_of_choices[drawn.rows[by_cost]], return_index=True)[1]
     coarse = refined(drawn.part(by_cost[np.union1d(best_choices, of_motors)]), first, CONTINUOUS, 3)
     free = coarse.part(best_of(coarse, REFINED // 2, first)) + buildable.part(best_of(buildable, REFINED // 2, first))
-    free = refined(free, first, CONTINUOUS, ALONG)
+    free = refined(free, first, CONTINUOUS, POINTS_PER_AXIS)
     evaluated = sum(d.evaluated for d in (drawn, tried, buildable, coarse, free))
 
     def sized(designs: _EvaluatedDesigns, k: int) -> SizedDesign:

@@ -67,12 +67,11 @@ def points_studied(found: SensitivityResult) -> str:
     (studied,) = parts.values()
     labels = [o.row.label for o in found.outputs.values() if o.studied.all()]
     rest = f", but all {total} for {', '.join(labels)}" if labels else ""
-    return (
-        f"At {fewest} of {total} operating points ({_in_words(found.points, ~studied)} left out, because {why}{rest})"
-    )
+    left_out = _points_in_words(found.points, ~studied)
+    return f"At {fewest} of {total} operating points ({left_out} left out, because {why}{rest})"
 
 
-def _in_words(points: OperatingPoints, mask: np.ndarray) -> str:
+def _points_in_words(points: OperatingPoints, mask: np.ndarray) -> str:
     """Points of a mask by the values of one axis, such as `20° and 18 more`."""
     _, imposed, unit = points.imposed
     axes = [(x, u) for _, x, u in points.ground[::-1]] + [(imposed, f" {unit}"), (points.configuration, "")]

@@ -60,8 +60,9 @@ def runs_document(
     if not (single and first_run["status"] in words.SETTLED):
         blocks.append(run_tables.endings_table(Counter(map(str, runs["status"]))))
     blocks += remarks([*notes, *([] if stands is None else [turn_words.posture_sentences(stands)])])
+    imposed = run_tables.imposed_column(table)
     shown_table = run_tables.quantity_table(
-        "runs", table, (run_tables.imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER),
+        "runs", table, (imposed, *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER),
         first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE, sideways=True,
     )  # fmt: skip
 
