@@ -15,7 +15,7 @@ EVERY = BY_NAME | OF_TURNS | OF_CHANNELS
 
 
 def said(kind, name):
-    return list(explain.EXPLAINED[kind](name, EVERY))
+    return list(explain.explanations(EVERY)[kind][name]())
 
 
 @pytest.fixture
@@ -25,13 +25,9 @@ def unsimulated(monkeypatch):
 
 
 def test_every_name_has_an_explanation_of_its_kind(unsimulated):
-    irregular = {
-        "statuses": "status", "verdicts of the loop": "verdict of the loop", "verdicts of a climb": "verdict of a climb",
-        "words of the reports": "word of the reports", "keys that no fit frees": "key of a robot file",
-    }  # fmt: skip
-    for kind, those in explain.explainable_names(EVERY).items():
-        for name in those:
-            lines = said(irregular.get(kind, kind.removesuffix("s")), name)
+    for by_name in explain.explanations(EVERY).values():
+        for name, about in by_name.items():
+            lines = list(about())
             assert lines and all(text and "None" not in text for _, text in lines), (name, lines)
 
 
@@ -71,7 +67,7 @@ def test_parameters_and_channels_are_explained_by_their_rows(robot):
     )
     assert lines["equation"].startswith("U_e = C_E ω + I R") and "5 %" in lines["prior"]
     assert dict(said("parameter", "6T2A.ground.friction.static"))["equation"]
-    lines = dict(said("channel", "speed_mm_s"))
+    lines = dict(said("channel", "speed"))
     assert "speed_sd_mm_s" in lines["column"] and lines["other units"].startswith("m/s, km/h")
     assert lines["typical noise"].startswith(f"{100 * channels.find_channel('speed').sd_share:g} %")
     assert "by its instrument: drawn from the supply by all motors" in dict(said("channel", "total_current"))["is"]
@@ -84,6 +80,7 @@ def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
     assert max(map(len, out.splitlines())) <= 80
     _, out, _ = ends(mmrjax("explain held out"), code=0)
     assert GLOSSARY["held out"] in " ".join(out.split())
+    ends(mmrjax("explain speed_mm_s"), "speed_mm_s: channel", code=0)
     ends(mmrjax("explain"), "series_resistance", "motor.resistance", "converged", code=0)
 
 

@@ -82,5 +82,5 @@ def test_few_points_fill_few_bins():
         "voltage": sweep_report.VariedQuantity(voltage, "V"),
         "r": sweep_report.VariedQuantity(resistance, "r"),
     }
-    histogram, *bands, _, _ = sweep_figures.draw_output_spread(0.1 * voltage + resistance, "I", varied).axes
+    histogram, *bands = sweep_figures.draw_output_spread(0.1 * voltage + resistance, "I", varied).axes
     assert [len(b.lines[0].get_xdata()) for b in bands] == [2, 6] and len(histogram.patches) == 6

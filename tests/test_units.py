@@ -92,8 +92,8 @@ def test_a_quantity_is_read_written_and_explained_by_its_row(two_rows_more, tmp_
     )
     (output,) = (o for o in outputs.output_table(runs.channels) if o.name == CHANNEL.name)
     assert (output.column, output.unit, output.label) == ("terminal_voltage_V", "V", "terminal voltage")
-    for kind, name in (("channel", "terminal_voltage"), ("condition", "depth_mm")):
-        assert dict(explain.EXPLAINED[kind](name, {}))["column"].startswith(f"{name.removesuffix('_mm')}_")
+    for kind, name in (("channel", "terminal_voltage"), ("condition", "depth")):
+        assert dict(explain.explanations({})[kind][name]())["column"].startswith(f"{name}_")
 
 
 def test_a_rig_states_a_channel_by_its_row(two_rows_more, tmp_path):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,10 @@ from mmrjax.errors import similar_words
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
 from mmrjax.model import channels, paper_robots, params, quantities
-from mmrjax.model.params import Spec
+from mmrjax.model.channels import Channel
+from mmrjax.model.params import Parameter, Spec
+from mmrjax.model.quantities import Condition
+from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Result
 from sweeps.console import print_output
 from sweeps.pages import words
@@ -27,16 +31,12 @@ from sweeps.report.climb_report import VERDICTS
 
 #: Effects by name.
 Library = dict[str, type[Effect]]
-#: A line of an explanation: heading and text.
-Line = tuple[str, str]
-#: Function that returns lines on a name, none if it has no such meaning.
-Explain = Callable[[str, Library], Iterator[Line]]
+#: Lines of an explanation, each with heading and text.
+Lines = Iterable[tuple[str, str]]
 WIDTH, INDENT = 80, 16
-#: Outputs of runs, and of missions.
-EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
-
-#: Keys of robot files that no fit frees, with their meanings.
-KEYS = {name: meaning for name, (_, _, meaning) in robot_file.SETTINGS.items()}
+#: Outputs of missions, of runs, and further ones.
+OF_MISSIONS = (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
+OUTPUTS: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *OF_MISSIONS)
 
 
 def explain_name(name: str | None, files: Names) -> int:
@@ -45,28 +45,57 @@ def explain_name(name: str | None, files: Names) -> int:
     Raises:
         BadConfiguration: the name is unknown. The message lists the nearest ones.
     """
-    library = {**effect_file.effect_library(files), **effects.BESIDE}
-    names = explainable_names(library)
+    kinds = explanations({**effect_file.effect_library(files), **effects.BESIDE})
     if name is None:
-        for kind, those in names.items():
-            print_output(_wrapped(kind, ", ".join(those)))
+        for kind, by_name in kinds.items():
+            print_output(_wrapped(kind, ", ".join(by_name)))
         print_output("mmrjax explain NAME explains one.")
         return 0
-    explained = False
-    for kind, about in EXPLAINED.items():
-        for k, (heading, text) in enumerate(about(name, library)):
-            if k == 0:
-                print_output(f"{name}: {kind}")
-            print_output(_wrapped(heading, text))
-            explained = True
-    if not explained:
-        below = [p for p in names["parameters"] if p.endswith(f".{name}")]
-        if below:
+    names = [n for by_name in kinds.values() for n in by_name]
+    every = (*OUTPUTS, *channels.EVERY, *quantities.SET, *quantities.LABELS)
+    columns = {getattr(q, field, None): q.name for q in every for field in ("column", "sd_column", "field")}
+    key = name if name in names else columns.get(name, name)
+    for kind, by_name in kinds.items():
+        if key in by_name:
+            print_output(f"{name}: {kind}")
+            for heading, text in by_name[key]():
+                print_output(_wrapped(heading, text))
+    if key not in names:
+        if below := [p for p in kinds["parameter"] if p.endswith(f".{name}")]:
             raise BadConfiguration(f"explain: got {name}; did you mean one of these? {', '.join(below)}")
-        close = similar_words(name, [n for those in names.values() for n in those], 3)
+        close = similar_words(name, names, 3)
         hint = f"did you mean {', '.join(close)}? " if close else ""
         raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists all names")
     return 0
+
+
+def explanations(library: Library) -> dict[str, dict[str, Callable[[], Lines]]]:
+    """Functions that return the lines on each name, by kind and name."""
+    robot = paper_robots.nominal()
+    verdict = "verdict of result.json of mmrjax {}"
+    loop, climb = words.LOOP_VERDICTS, {name: meaning for name, (_, meaning) in VERDICTS.items()}
+    keys = {name: meaning for name, (_, _, meaning) in robot_file.SETTINGS.items()}
+    glossary = {name: meaning for name, meaning in words.GLOSSARY.items() if name not in loop}
+    partial = functools.partial
+    return {
+        "effect": {n: partial(_effect_lines, e) for n, e in library.items() if n not in effects.UNNAMED},
+        "status": {name: partial(_status_lines, name) for name in words.STATUSES},
+        "verdict of the loop": _from_table(loop, verdict.format("loop")),
+        "verdict of a climb": _from_table(climb, verdict.format("climb")),
+        "flag": _from_table(words.FLAGS, "column flags of runs.csv, counts in result.json"),
+        "channel": {c.name: partial(_channel_lines, c, library) for c in channels.EVERY},
+        "output": {o.name: partial(_output_lines, o.name) for o in OUTPUTS},
+        "parameter": {p.name: partial(_parameter_lines, p, robot, library) for p in params.walk_parameters(robot)},
+        "key of a robot file": _from_table(keys),
+        "condition": {c.name: partial(_condition_lines, c) for c in (*quantities.LABELS, *quantities.SET)},
+        "word of the reports": _from_table(glossary),
+    }
+
+
+def _from_table(meanings: Mapping[str, str], where: str = "") -> dict[str, Callable[[], Lines]]:
+    """Explanations of the names in a table of meanings. `where`: files in which they occur."""
+    further = [("in files", where)] * bool(where)
+    return {name: functools.partial(list, [("means", text), *further]) for name, text in meanings.items()}
 
 
 def _wrapped(heading: str, text: str) -> str:
@@ -77,27 +106,7 @@ def _wrapped(heading: str, text: str) -> str:
     )  # fmt: skip
 
 
-def explainable_names(library: Library) -> dict[str, list[str]]:
-    """Every name that can be explained, by kind."""
-    return {
-        "effects": [name for name in library if name not in effects.UNNAMED],
-        "words of the reports": [word for word in words.GLOSSARY if word not in words.LOOP_VERDICTS],
-        "statuses": list(words.STATUSES),
-        "verdicts of the loop": list(words.LOOP_VERDICTS),
-        "verdicts of a climb": list(VERDICTS),
-        "flags": list(words.FLAGS),
-        "channels": [c.name for c in channels.EVERY],
-        "conditions": [*(c.name for c in quantities.LABELS), *(c.field for c in quantities.SET if c.field)],
-        "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
-        "keys that no fit frees": list(KEYS),
-        "parameters": [p.name for p in params.walk_parameters(paper_robots.nominal())],
-    }
-
-
-def _effect_lines(name: str, library: Library) -> Iterator[Line]:
-    effect = library.get(name)
-    if effect is None:
-        return
+def _effect_lines(effect: type[Effect]) -> Lines:
     equation, meaning, source = experiment_words.effect_summary(effect)
     yield "equation", equation
     yield "stands for", meaning
@@ -122,10 +131,10 @@ def _effect_lines(name: str, library: Library) -> Iterator[Line]:
         yield "" if k else "on a bench", test
     if source:
         yield "source", source
-    yield "in a file", f"[effects.{name}] amplitude = ..."
+    yield "in a file", f"[effects.{effect.name}] amplitude = ..."
 
 
-def _change_sentences(effect: Effect) -> Iterator[str]:
+def _change_sentences(effect: Effect) -> Iterable[str]:
     """Sentences on the change of settled travel by a typical size of an effect, in percent of the readings.
 
     Empty if settled travel does not show the effect or the runs have no operating point.
@@ -155,29 +164,13 @@ def _change_sentences(effect: Effect) -> Iterator[str]:
             yield f"change at its typical size ({name}, 24 V, 5°, 3 kg): {changes}"
 
 
-def _status_lines(name: str, library: Library) -> Iterator[Line]:
-    if name in words.STATUSES:
-        yield "means", words.status_meaning(name)
-        yield "exit code", "3, since a solver failed" if name == "failed" else "0"
-        yield "in files", "column status of runs.csv, counts in result.json"
+def _status_lines(name: str) -> Lines:
+    yield "means", words.status_meaning(name)
+    yield "exit code", "3, since a solver failed" if name == "failed" else "0"
+    yield "in files", "column status of runs.csv, counts in result.json"
 
 
-def _explain_by_table(meanings: Mapping[str, str], where: str = "") -> Explain:
-    """Function that explains the names in a table of meanings. `where`: files in which they occur."""
-
-    def about(name: str, library: Library) -> Iterator[Line]:
-        if name in meanings:
-            yield "means", meanings[name]
-            if where:
-                yield "in files", where
-
-    return about
-
-
-def _channel_lines(name: str, library: Library) -> Iterator[Line]:
-    c = next((c for c in channels.EVERY if name in (c.name, c.column, c.sd_column)), None)
-    if c is None:
-        return
+def _channel_lines(c: Channel, library: Library) -> Lines:
     low, high = c.range
     yield "is", f"{c.label} [{c.unit_shown}], as shown by its instrument{c.where and f': {c.where}'}"
     yield "column", f"{c.column}, its standard deviation {c.sd_column}, {low:g} to {high:g}"
@@ -192,43 +185,32 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
             yield "" if k else "on a bench", test
 
 
-def _operating_condition_lines(name: str, library: Library) -> Iterator[Line]:
-    if label := next((label for label in quantities.LABELS if label.name == name), None):
-        yield "is", label.label
-        yield "column", label.column
-    c = next((c for c in quantities.SET if name in (c.name, c.field, c.column)), None)
-    if c is None:
-        return
-    low, high = c.range
-    yield "is", f"{c.label} [{c.unit_shown or '-'}], {low:g} to {high:g}"
+def _condition_lines(c: Any) -> Lines:
+    if isinstance(c, Condition):
+        yield "is", f"{c.label} [{c.unit_shown or '-'}], {c.range[0]:g} to {c.range[1]:g}"
+        if c.other_units:
+            yield "other units", ", ".join(c.other_units)
+        if c.field:
+            yield "from Python", f"mm.Conditions({c.field}=...)"
+    else:
+        yield "is", c.label
     yield "column", c.column
-    if c.other_units:
-        yield "other units", ", ".join(c.other_units)
-    if c.field:
-        yield "from Python", f"mm.Conditions({c.field}=...)"
 
 
-def _output_lines(name: str, library: Library) -> Iterator[Line]:
-    for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
+def _output_lines(name: str) -> Lines:
+    # The description is in the docstring of the class.
+    text = " ".join((inspect.getdoc(Result) or "").partition("Attributes:")[2].split())
+    match = re.search(rf"(?:^|[.\]] |, |; )(?:\w+, )*{name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text)
+    for o in (o for o in OUTPUTS if o.name == name):
         yield "is", f"{o.label} [{o.unit_shown}]"
-        # The description is in the docstring of the class.
-        text = " ".join((inspect.getdoc(Result) or "").partition("Attributes:")[2].split())
-        match = re.search(
-            rf"(?:^|[.\]] |, |; )(?:\w+, )*{o.name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text
-        )
         if match is not None and o in outputs.FURTHER:
             yield "equation", match[1].rstrip(".")
-        source_words = (
-            "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"
-        )
-        yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else source_words}"
+        source = "missions (--profile)" if o in OF_MISSIONS else "every run"
+        yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else source}"
 
 
-def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
-    robot = paper_robots.nominal()
-    parameter = next((p for p in params.walk_parameters(robot) if p.name == name), None)
-    if parameter is None:
-        return
+def _parameter_lines(parameter: Parameter, robot: Robot, library: Library) -> Lines:
+    name = parameter.name
     spec = parameter.spec
     yield "means", f"{spec.meaning} [{spec.unit}]"
     yield "nominal", f"{float(parameter.value):g} {spec.unit}. Source: {spec.source}"
@@ -255,23 +237,3 @@ def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
 def _bounds_text(spec: Spec) -> str:
     low, high = spec.bounds
     return f"{low:g} to {high:g} {spec.unit}"
-
-
-#: Function that explains a name, by kind.
-EXPLAINED: dict[str, Explain] = {
-    "effect": _effect_lines,
-    "status": _status_lines,
-    "verdict of the loop": _explain_by_table(words.LOOP_VERDICTS, "verdict of result.json of mmrjax loop"),
-    "verdict of a climb": _explain_by_table(
-        {name: meaning for name, (_, meaning) in VERDICTS.items()}, "verdict of result.json of mmrjax climb"
-    ),
-    "flag": _explain_by_table(words.FLAGS, "column flags of runs.csv, counts in result.json"),
-    "channel": _channel_lines,
-    "output": _output_lines,
-    "parameter": _parameter_lines,
-    "key of a robot file": _explain_by_table(KEYS),
-    "condition": _operating_condition_lines,
-    "word of the reports": _explain_by_table(
-        {k: v for k, v in words.GLOSSARY.items() if k not in words.LOOP_VERDICTS}
-    ),
-}
