@@ -21,7 +21,7 @@ from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
 from mmrjax.model import channels, quantities
 from mmrjax.undercarriage.ripple_peaks import SIGNALS
-from sweeps import capabilities, cli, config
+from sweeps import capabilities, config
 from sweeps.commands import sweep
 from tests.commands import columns_of, command, read_json
 
@@ -298,13 +298,6 @@ def test_columns_that_a_rig_may_lack_and_those_of_exports_are_known():
     assert of_heat <= set(capabilities.RESTS_ON)
 
 
-def test_an_unknown_name_a_coulomb_and_a_twin_are_found(tmp_path):
-    (tmp_path / "a.csv").write_text("discharge_C,travel_mm_s,speed_mm_s\n1,2,2\n2,3,3\n")
-    (tmp_path / "b.json").write_text('{"of": [{"sag_V": 1, "total_current_A": 2}], "set": {"x_V": 1}}')
-    assert set(unknown(tmp_path)) == {"discharge_C", "travel_mm_s", "sag_V"}
-    assert twins(tmp_path / "a.csv") == [("travel_mm_s", "speed_mm_s")]
-
-
 # --- files ----------------------------------------------------------------------------------------------------------
 
 POINTS = "--voltages", "24", "--payloads", "0,2", "--slopes", "0,5", "--configurations", "6T2A", "--no-report"
@@ -344,26 +337,6 @@ def test_files_of_a_sweep_and_of_its_runs_simulated_hold_the_same_numbers(made, 
     assert len(same(one, other)) > 15
 
 
-@pytest.mark.slow
-def test_an_export_has_conditions_in_the_units_of_their_columns(folder):
-    """A discharge of 1800 C is 500 mAh. It was a column discharge_C, whose end is that of a temperature."""
-    (folder / "charge.toml").write_text(
-        '[conditions]\nbattery = 1\nconfiguration = "6T2A"\n[axes]\ndischarge = [0, 1800]\n'
-    )
-    run(folder, "sweep", "charge.toml", "--export", "csv", "--no-report", "--out", "charge")
-    sound(folder / "charge")
-    assert numbers(folder / "charge/runs.csv")["discharge_mAh"].tolist() == [0.0, 500.0]
-
-
-@pytest.mark.slow
-def test_files_of_compare_hold_the_numbers_of_runs(made):
-    compared = made("compare", "compare", "measured", "--no-report")
-    sound(compared)
-    one, other = (numbers(compared / n) for n in ("comparison.csv", "runs.csv"))
-    simulated = {n.removeprefix("simulated_"): x for n, x in one.items() if n.startswith("simulated_")}
-    assert same(simulated, other) == {c.column for c in channels.usual_channels()}
-
-
 DRIVE = "simulate", "--model", "drive", "--duration", "2", "--voltage", "24", "--slope", "2", "--no-report"
 WALK = "time_s,supply_voltage_V\n0,24\n2,24\n"
 
@@ -384,24 +357,11 @@ def test_files_over_time_end_on_the_numbers_of_their_runs(made, folder):
     assert rows["winding_temperature_C"][-1] == pytest.approx(numbers(mission / "runs.csv")["winding_end_C"][0])
 
 
-@pytest.mark.slow
-def test_files_of_a_calibration_are_those_of_compare_with_its_robot(made, folder):
-    found = made("calibrate", "calibrate", "measured", "--starts", "2", "--no-profiles", "--no-report")
-    sound(found)
-    compared = made("after", "compare", "measured", "--robot", "calibrate/robot.toml", "--no-report")
-    rows, other = numbers(found / "rows.csv"), numbers(compared / "comparison.csv")
-    after = {n.replace("after_", "simulated_"): x for n, x in rows.items() if n.startswith("after_")}
-    assert len(same(after, other)) == 3
-    assert same(rows, other) >= {f"error_{c.name}_percent" for c in channels.usual_channels()}
-    assert {c.sd_column for c in channels.usual_channels()} <= set(rows)
-    for name, arguments in {
-        "posterior": ("simulate", "--voltage", "24"), "comparison": ("compare", "measured"), "sweeps": ("sweep", *POINTS)
-    }.items():  # fmt: skip
-        sound(made(name, *arguments, "--robot", "calibrate/robot.toml", "--posterior", "10", "--no-report"))
-
-
 #: The rest of the commands, on little.
 OTHERS = {
+    "compare": ("compare", "measured", "--no-report"),
+    "calibrate": ("calibrate", "measured", "--starts", "2", "--no-profiles", "--no-report"),
+    "charge": ("sweep", "charge.toml", "--export", "csv", "--no-report"),
     "check": ("check", "few.toml", "--no-report", "--no-changes"),
     "size": ("size", "few.toml", "--starts", "8", "--motors", "RE 30 24 V", "--no-report"),
     "sensitivity": (
@@ -422,16 +382,11 @@ OTHERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", OTHERS)
 def test_files_of_every_other_command_have_known_names(made, folder, name):
+    (folder / "charge.toml").write_text(
+        '[conditions]\nbattery = 1\nconfiguration = "6T2A"\n[axes]\ndischarge = [0, 1800]\n'
+    )
     (folder / "few.toml").write_text("speed_m_s = 0.3\nmass_kg = 30\n[envelope]\nslope_deg = [0, 5]\n")
     test_settle.bench(folder, test_settle.stairs())
     # In closed form: its files are the same.
     with runs_of("waves") if name == "resonance" else contextlib.nullcontext():
         sound(made(name, *OTHERS[name]))
-
-
-@pytest.mark.slow
-def test_every_command_that_leaves_a_folder_is_walked():
-    """Without those that write no table of results: a picture, a text, a robot's file, a model, measured data as read."""
-    asked = {words[0] for words in OTHERS.values()} | {"sweep", "simulate", "compare", "calibrate"}
-    commands = {(c.name or c.callback.__name__) for c in cli.app.registered_commands}
-    assert commands - asked == {"render", "explain", "export", "inspect"}
