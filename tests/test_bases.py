@@ -124,12 +124,6 @@ def test_time_of_a_single_ramp_is_no_driver(voltage, expected):
     assert any(v.startswith("time") for v in variables(window_families(*logged, scope=scope))) == expected
 
 
-def test_collinearity_is_not_made_by_the_number_of_terms():
-    """R² of noise is the share of the parameters. Adjusted for them it is about 0."""
-    found = [order_collinearity(shuffled(table(), seed), COUNTS) for seed in range(40)]
-    assert abs(np.mean(found)) < 0.1
-
-
 def variables(found):
     return [v for _, v in family_names(found)]
 
@@ -263,17 +257,6 @@ def test_tables_of_one_size_have_families_of_one_size(seed):
         assert shapes(columns, weight) == first
 
 
-def test_families_that_fill_up_repeat_others():
-    """What stands in the place of a family that says nothing is one that is there already, so that it finds nothing
-    that this does not."""
-    found = (*curve_families(table(), COUNTS), *window_families(table(order=np.repeat([1.0, 2, 3, 60], 15)), COUNTS))
-    for basis in found:
-        first = {}
-        for name, columns in zip(basis.names, np.asarray(basis.columns), strict=True):
-            assert_array_equal(columns, first.setdefault(name, columns))
-    assert len(set(family_names(found))) < len(family_names(found))
-
-
 # --- waves of a shaft -----------------------------------------------------------------------------------
 
 
@@ -309,8 +292,3 @@ def test_pieces_of_a_wave_have_one_phase_in_all_runs():
         wave = found[f"order {k} of the driving shaft"]
         assert_allclose(wave[:, :2].T, [np.cos(k * angle), np.sin(k * angle)])
         assert not wave[:, 2:].any()
-
-
-def test_a_shaft_that_stands_has_no_waves():
-    angle, rows = back_and_forth(0.0)
-    assert wave_families(np.zeros(angle.size, bool), angle, rows, rows, BALANCES) == ()

@@ -17,7 +17,6 @@ import calibration
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.robot_file import load_robot, read_robot
-from calibration.discovery.result import DiscoveryResult
 from calibration.inference import observers
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
@@ -25,9 +24,8 @@ from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import noise_from_table, parse_noise
 from calibration.inference.observers import SettledRuns
 from calibration.inference.priors import default_names, parameter_coordinates
-from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOutErrors
+from calibration.inference.result import HeldOutErrors
 from calibration.inference.simulation_errors import relative_error, root_mean_square
-from mmrjax.fidelities.results import Results
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels
 from mmrjax.model.paper_robots import nominal
@@ -125,25 +123,6 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     assert [" by slope " in line or " by voltage and configuration " in line for line in table] == [True, True]
 
 
-def test_a_terminal_has_few_lines_of_a_calibration(found, capsys):
-    """The answer, the verdict, what moved most, errors of rows left out, and what to check."""
-    print_document(calibration_document(found, "nominal"), brief=True)
-    answer, verdict, moved, *_, check = capsys.readouterr().out.splitlines()
-    farthest = max((p for p in found.parameters.values() if not p.held_by_prior), key=lambda p: abs(p.shift))
-    assert len(_) <= 1 and answer.startswith("The fit is") and verdict == f"{found.adequacy.statement}."
-    assert moved.startswith("These runs determine ") and f"{farthest.value:.3g} ± {farthest.sd:.2g}" in moved[:130]
-    assert f"{len(found.notes)} further remarks" in check
-
-
-def test_errors_and_rows_have_one_spelling_over_all_results():
-    errors = ChannelErrors(3, 2.5, 4.0, 1.1, 0.02)
-    assert errors["rms_percent"] == errors.rms_percent == 2.5 and errors["rows"] == 3
-    with pytest.raises(KeyError, match="rms_per_cent"):
-        errors["rms_per_cent"]
-    for kind in (CalibrationResult, DiscoveryResult, Results):
-        assert callable(kind.rows_table), kind
-
-
 def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured):
     made = noise_of(
         changed(measured, total_current_sd_A=np.full(20, 0.05), speed_sd_mm_s=np.full(20, 4.0)), "current=2%"
@@ -220,28 +199,6 @@ def test_thousands_of_rows_are_compared_at_once(measured):
 
 
 @pytest.mark.slow
-def test_histories_are_not_fitted_by_steady(measured):
-    level = dict(supply_voltage_V=15.0, slope_deg=0.0, total_mass_kg=13.1, payload_kg=0.0, configuration="6T2A")
-    columns = {name: np.full(20, value) for name, value in level.items()} | {"time_s": np.arange(20.0)}
-    moving = np.arange(20) > 0  # it starts from rest
-    columns |= {name: measured[name] * moving for name in ("motor_speed_rpm", "speed_mm_s")}
-    with pytest.raises(
-        BadConfiguration, match="--model steady: measured holds time histories; they need --model drive"
-    ):
-        quick(changed(measured, **columns), model="steady")
-
-
-@pytest.mark.parametrize("options, says", [
-    ({"model": "trak"}, r"--model trak: no such fidelity; .*allowed: steady, drive"),
-    ({"model": "drive", "free": ["default", "running_gear.guide_recess"]},
-     "--free running_gear.guide_recess: --model drive does not use it; allowed: --model track"),
-])  # fmt: skip
-def test_what_cannot_be_asked_of_a_fidelity_is_refused(measured, options, says):
-    with pytest.raises(BadConfiguration, match=says):
-        quick(measured, **options)
-
-
-@pytest.mark.slow
 def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
     made = quick(measured, free=["default", "motor.inductance", "6T2A.mass"])
     assert {Remark("unmeasured", name=name) for name in ("motor.inductance", "6T2A.mass")} <= {*made.remarks}
@@ -306,13 +263,6 @@ def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(ga
     )
     for name in ("z", "sd", "cost"):
         assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-def test_too_few_readings_are_counted(gaps):
-    with pytest.raises(
-        BadData, match=r"5 readings in 3 rows cannot fit 6 parameters; at least 6 readings are needed"
-    ):
-        quick(gaps.where(np.array([1, 2, 3])), noise="current=2%,speed=1%")
 
 
 # --- other robots, another channel ----------------------------------------------------------------------

@@ -9,12 +9,10 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 import calibration
 import mmrjax as mm
-from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.prediction import ReadingsOfRows
@@ -23,8 +21,7 @@ from calibration.inference import observers
 from calibration.inference.estimates import condition_columns, readings_by_channel
 from calibration.inference.noise import default_noise, infer_noise, noise_from_table
 from calibration.inference.result import CalibrationResult
-from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import channels, params, quantities
+from mmrjax.model import channels, quantities
 from tests.commands import csv_text, text_file
 
 RIG = """base = "none"
@@ -233,30 +230,3 @@ def test_two_rigs_in_turn_and_side_by_side_are_read_as_alone(tmp_path):
 
 
 # --- with their fits
-
-
-def measured_with(robot, folder, changed, sd=0.01):
-    """A table of settled runs that a robot with other values shows, with noise."""
-    layout = Layout.of(robot)
-    columns = {"configuration": np.full(12, "brake"), "supply_voltage_V": VOLTAGES}
-    truth = params.replace(robot, {name: np.asarray(value) for name, value in changed.items()})
-    shown = steady_batch(truth, Runs("made", columns, layout=layout).conditions(robot)).reading
-    drawn, table = default_rng(1), {"supply_voltage_V": VOLTAGES}
-    for c in robot.channels:
-        x = np.asarray(shown[c.name]) / c.factor
-        table |= {c.column: x * (1 + sd * drawn.standard_normal(12)), c.sd_column: sd * np.abs(x)}
-    return written(folder / "t.csv", table)
-
-
-@pytest.mark.slow
-def test_what_the_loop_finds_is_written_under_its_channels(tmp_path, bench):
-    path = measured_with(bench, tmp_path, {"brake.loss_coulomb": 0.4})
-    runs = calibration.read_runs(path, robot=bench)
-    found = calibration.discover(runs, bench, replicates=20)
-    table = found.rows_table()
-    assert "speed_mm_s" not in table and found.channels == bench.channels
-    for c in bench.channels:
-        assert_allclose(table[c.column], runs[c.column], rtol=1e-12)
-        assert_allclose(table[f"after_{c.column}"], runs[c.column], rtol=0.1)
-    found.save(tmp_path / "found")
-    assert set(found.noise) == set(TORQUE)

@@ -13,10 +13,9 @@ import pytest
 import rich.text
 import typer
 
-from calibration.data.input_errors import BadConfiguration
 from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, options
-from sweeps.config import Calibrate, Compare, Loop, Sweep, as_toml, resolve_configuration
+from sweeps.config import Sweep, as_toml, resolve_configuration
 from sweeps.points.scale import Compiled, share_counter
 from tests.commands import ends, read_json
 from tests.commands import rows as table
@@ -163,23 +162,6 @@ def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeyp
     assert (tmp_path / "s/runs.csv").read_text() == (tmp_path / "t/runs.csv").read_text()
 
 
-def test_help_is_quick():
-    def counted():  # processor time of a count, 0.02 s on the machine for which the limit is stated
-        start = time.process_time()
-        sum(1 for _ in range(1_000_000))
-        return time.process_time() - start
-
-    def spent(arguments):  # what the tests beside this one take counts little
-        start = os.times()
-        subprocess.run([*MMRJAX, *arguments, "--help"], capture_output=True, check=True)
-        end = os.times()
-        return end.children_user - start.children_user + end.children_system - start.children_system
-
-    limit = 0.5 * max(1.0, min(counted() for _ in range(3)) / 0.02)
-    for command in ([], ["sweep"]):
-        assert any(spent(command) < limit for _ in range(6))
-
-
 @pytest.mark.parametrize("given", [None, "", "--xla_cpu_use_fusion_emitters=false"])
 @pytest.mark.parametrize("model", ["track", "drive", "steady"])
 def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, given, model):
@@ -247,14 +229,6 @@ def test_no_word_in_brackets_is_lost_from_a_help():
         assert rich.text.Text.from_markup(text).plain == text.replace("\\[", "["), text
 
 
-def test_mmrjax_alone_prints_commands_that_exist(mmrjax):
-    code, out, _ = mmrjax()
-    lines = [line for line in out.splitlines() if line.startswith("  mmrjax ")]
-    assert len({len(line.rstrip()) - len(re.split("  +", line.strip())[1]) for line in lines}) == 1  # one column
-    names = [line.split()[1] for line in lines]
-    assert code == 0 and len(names) == 3 and {*names} <= {*typer.main.get_command(cli.app).commands}
-
-
 @pytest.mark.slow
 def test_check_passes_on_this_installation(mmrjax):
     _, out, _ = ends(mmrjax("--check"), "24 V / C_E", code=0)
@@ -268,16 +242,6 @@ def test_check_passes_on_this_installation(mmrjax):
 ])  # fmt: skip
 def test_axis_takes_values_and_ranges(text, values):
     assert options.parse_axis("--slopes", text) == pytest.approx(values)
-
-
-def test_configuration_has_what_applies_to_its_command_alone():
-    told = {kind: set(kind.model_fields) for kind in (Loop, Calibrate, Compare, Sweep)}
-    assert not told[Loop] & {"duration_s", "step_s", "battery", "chunk", "voltages_V"}
-    assert "model" in told[Calibrate] and not told[Calibrate] & {"duration_s", "battery", "chunk"}
-    assert not told[Compare] & {"battery", "discharge_mAh", "chunk", "slopes_deg"}
-    assert "duration_s" not in as_toml(resolve_configuration(Loop, None, {"seed": 1}))
-    with pytest.raises(BadConfiguration, match=r"^duration_s: no such key"):
-        resolve_configuration(Loop, None, {"duration_s": 1.0})
 
 
 @pytest.mark.parametrize("model, expected", [("steady", {}), ("drive", {"duration_s": 30.0}),

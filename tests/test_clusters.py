@@ -80,12 +80,6 @@ def test_outliers_of_one_level_are_found_there():
     assert "cluster at supply_voltage_V 24.0" in cluster_sentence(got)
 
 
-def test_the_least_probable_cluster_is_told():
-    """Outliers of one run are also within its stretch of the order. The run says it with fewer words and a level."""
-    got = found(drawn(RUN == "start3", 12), axes={}, levels=LEVELS)
-    assert got is not None and (got.axis, got.level) == ("run_id", "start3")
-
-
 def test_two_outliers_are_no_cluster():
     assert outliers.FEWEST == 3 and found([100, 101]) is None and found([]) is None
 

@@ -88,13 +88,6 @@ def test_cache_switched_off_has_no_place(word, monkeypatch):
 
 
 @pytest.mark.slow
-def test_process_with_cache_switched_off_keeps_nothing(tmp_path):
-    done = process("off", XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path))
-    assert done["folder"] is None and done["kept"] == done["read"] == 0
-    assert not [p for p in tmp_path.iterdir() if p.name != ".nv"]  # a GPU's driver leaves that one
-
-
-@pytest.mark.slow
 def test_unwritable_place_switches_the_cache_off(tmp_path):
     (tmp_path / "file").write_text("")
     done = process(tmp_path / "file")

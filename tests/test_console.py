@@ -10,7 +10,6 @@ import pytest
 from calibration.described import describe
 from calibration.inference.fit_notes import progress_remark
 from calibration.words import step_words as steps
-from calibration.words.step_words import still_running_sentence
 from sweeps import console
 from sweeps.console import step_reporter
 
@@ -34,12 +33,6 @@ def test_silence_is_broken_by_what_goes_on():
     between = said[1:-1]
     assert len(between) >= 2 and all(text.startswith("still fitting (") for text in between)
     assert "compiled)" in between[-1]
-
-
-def test_what_goes_on_is_said_with_what_was_compiled():
-    assert still_running_sentence("fitting", 41.6, 0) == "still fitting (42 s)"
-    assert still_running_sentence("fitting", 41.6, 1) == "still fitting (42 s, 1 program compiled)"
-    assert still_running_sentence("fitting", 9.6, 12) == "still fitting (10 s, 12 programs compiled)"
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -66,10 +59,3 @@ def test_a_command_says_soon_that_it_works(monkeypatch, capsys):
     with console.report_working("size"):
         time.sleep(0.4)
     assert capsys.readouterr().err == "size: working\n"
-
-
-def test_a_stage_is_reported_as_it_begins(capsys):
-    with console.report_stage(2, 3, "posture"):
-        assert capsys.readouterr().err == "2 of 3, posture\n"
-    with console.report_stage(3, 3, "a bar", silent=True):
-        assert capsys.readouterr().err == "3 of 3, a bar\n"

@@ -151,26 +151,6 @@ def test_derivatives_of_a_step_are_those_of_what_it_computes(eventful, forward, 
     assert sum(float(jnp.sum(a * b)) for a, b in pairs) == pytest.approx(float(_some(*ours)), rel=1e-8)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["running_gear.contact_stiffness", "6T2A.track.guide_friction"])
-def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name):
-    """What else is constant has no derivative to begin with."""
-    run = Conditions(**RUNS["tracked"])
-    motion = motion_of(recessed, run, 1)
-    value = next(p.value for p in params.walk_parameters(recessed) if p.name == name)
-
-    @jax.jit
-    def both(x):
-        def after(x, step):
-            return _stepped(params.replace(recessed, {name: x}), run, motion, STEP, step)
-
-        return [jax.jvp(lambda x, s=s: after(x, s), (x,), (x,))[1] for s in (advance, _as_computed)]
-
-    ours, theirs = both(value)
-    _equal(ours, theirs)
-    assert max(float(jnp.abs(x).max()) for x in jax.tree.leaves(theirs[0])) > 0
-
-
 @pytest.mark.nightly
 def test_second_derivatives_are_those_of_what_is_computed(recessed):
     run = Conditions(**RUNS["tracked"])

@@ -155,11 +155,6 @@ def test_an_integral_brings_speed_and_current_to_their_goals(actuator, goal, val
     assert_allclose(getattr(signals, signal)[0, row], value, rtol=5e-3)
 
 
-def test_steps_follow_a_goal(actuator):
-    own = servo.simulate(held(0.5), np.array([0.0, 0.6]), servo.TRUE)[0][-1]
-    assert stepped(actuator(), 60, 0.01, begins=0.0) == pytest.approx(own, abs=2e-3)
-
-
 def test_a_motor_that_is_off_coasts(actuator):
     log = {"time_s": np.arange(4) * 0.1, "goal_angle_deg": [0.0, 30, 30, 30], "output_angle_deg": [0.0, 0, 5, 20],
            "mode": ["voltage", "voltage", "coast", "voltage"]}  # fmt: skip
@@ -309,20 +304,3 @@ def test_a_log_at_the_rate_of_its_controller_gives_the_gain(tmp_path, late):
     kp = found.parameters["controller.kp"]
     assert abs(kp.value - slower["kp"]) < 2 * kp.sd < 0.2
     assert over_noise(found.robot, log) < 1.2
-
-
-@pytest.mark.slow
-def test_goal_and_angle_alone_give_a_servos_parameters(tmp_path):
-    t = np.arange(0, 4.5, 0.01)
-    swings = np.where(t < 3, 0.6 * np.sin(3 * np.pi * (t - 1.6)), np.where(t < 3.8, np.sin(6 * np.pi * t), -0.9))
-    goal = np.where(t < 0.2, 0.0, np.where(t < 0.9, 0.8, np.where(t < 1.6, -0.5, swings)))
-    found = fitted(tmp_path, text_with(PRIOR), servo_log(goal)[0])
-    truth = {
-        "controller.kp": 8.0, "controller.kd": 0.1, "motor.torque_constant": 0.006, "horn.inertia": 5e-4,
-        "horn.loss_coulomb": 0.02,
-    }  # fmt: skip
-    for name, true in truth.items():
-        estimate = found.parameters[name]
-        assert abs(estimate.value - true) < 3 * estimate.sd, name
-        assert abs(estimate.value / true - 1) < 0.1, name
-    assert over_noise(found.robot, servo_log(-0.7 * goal[::-1] + 0.7 * goal[-1], seed=2)[0]) < 1.2

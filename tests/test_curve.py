@@ -15,24 +15,14 @@ from calibration.data.robot_file import read_robot, write_robot
 from calibration.inference.bases import BALANCES, OF_TURNS, VARIABLES, CurveScope, curve_families, window_families
 from mmrjax import effects
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
-from mmrjax.fidelities.drive import drive
 from mmrjax.model import balances, channels, params
-from mmrjax.model.paper_robots import blank_robot, nominal
-from mmrjax.model.rig import Rig
-from mmrjax.model.robot import Configurations
-from mmrjax.model.shaft import Shaft
+from mmrjax.model.paper_robots import nominal
 from mmrjax.model.signals import Signals
 from tests.commands import read_rig
 
 EACH = pytest.mark.parametrize("effect", CURVES.values(), ids=list(CURVES))
 SHAPE = {"y0": 0.7, "y1": -0.4, "y2": 1.1, "y3": 0.2, "y4": -0.9, "y5": 0.5}
-#: Two starts from rest, and instants of them [s].
-STARTS, TIMES = jax.tree.map(lambda x: x[:2], laws.CONDITIONS), jnp.asarray([0.0, 0.003, 0.1, 0.6])
 SIZES = jnp.asarray([laws.size(c) for c in CURVES.values()])
-
-
-#: In runs of `drive`: in every balance a curve of the state, one over time, and a wave.
-DRIVEN = {n: e for n, e in UNNAMED.items() if n.endswith(("speed_motor", "time")) or n.startswith("wave")}
 
 
 def robot(amplitudes=None, kinds=CURVES):
@@ -103,31 +93,11 @@ def _steady(bare):
     return jax.vmap(lambda c: laws.floats(laws.steady(bare, c).reading))(laws.CONDITIONS)
 
 
-def _driven(amplitudes):
-    there = robot(amplitudes, DRIVEN)
-
-    def one(c):
-        return laws.readings(there, drive(there, c, TIMES, tolerance=1e-9).signals)[1:]
-
-    return jax.vmap(one)(STARTS)
-
-
 @pytest.mark.slow
 def test_settled_travel_shows_nothing_of_a_wave():
     waves = robot(jnp.asarray([laws.size(w) for w in WAVES.values()]), WAVES)
     # but for rounding: a program with effects sums in another order
     assert_allclose(jax.jit(_steady)(waves), jax.jit(_steady)(nominal()), rtol=4e-15)
-
-
-@pytest.mark.slow
-def test_curves_act_in_drive_and_at_zero_change_nothing():
-    sizes = jnp.asarray([laws.size(e) for e in DRIVEN.values()])
-    both = jax.jit(lambda a: jax.jvp(_driven, (a,), (0.1 * sizes,)))
-    still, slope = both(jnp.zeros(len(DRIVEN)))
-    bare = nominal()
-    plain = jax.jit(jax.vmap(lambda c: drive(bare, c, TIMES, tolerance=1e-9)))(STARTS)
-    assert_allclose(still, laws.readings(bare, plain.signals)[:, 1:], rtol=1e-7, atol=1e-7)
-    assert np.isfinite(slope).all() and np.abs(slope / still).max() > 1e-3
 
 
 @EACH
@@ -173,16 +143,6 @@ def test_curves_are_those_that_the_trace_looks_for():
     assert {b: u for b, (u, *_) in curve.BALANCES.items()} == {b: balances.BALANCES[b][0] for b in curve.BALANCES}
     assert set(curve.READINGS) == {c.name for c in channels.EVERY} - {*curve.ROUND}  # a heading is no `yaw` moment
     assert set(curve.READ_BY) <= set(curve.READINGS)
-    robot = replace(
-        blank_robot(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
-        rig=Rig(channels=("output_torque", "position")),
-    )
-    columns = {name: np.arange(9.0) for name in ("order", "total_current_A", "motor_speed_rpm")}
-    columns |= {"configuration": np.repeat("bench", 9), "supply_voltage_V": np.tile([6.0, 12.0, 24.0], 3)}
-    ways, scope = dict.fromkeys(curve.WAYS, np.ones(9)), CurveScope.of(robot, columns)
-    (basis,) = (b for b in curve_families(columns, np.ones(9), ways, scope) if b.places[0] in curve.READINGS)
-    assert set(basis.names) == {("output_torque", "order"), ("output_torque", "current"), ("position", "order")}
-    assert all(f"curve_{place}_{over}" in UNNAMED for place, over in basis.names)
 
 
 @pytest.mark.parametrize("law", [laws.law_declared, laws.law_linear, laws.law_unit], ids=lambda law: law.__name__[4:])

@@ -1,9 +1,6 @@
 """Derived outputs: the steepest slope and the start, against closed forms, other searches and finite differences."""
 
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import equinox as eqx
@@ -13,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mmrjax import SOUND_AT_LEVEL_0, derived
+from mmrjax import derived
 from mmrjax.compile.compiling import SELDOM
 from mmrjax.compile.programs import compile_with_options
 from mmrjax.derived import pitch_and_step, start_figures, steepest_slope
@@ -104,26 +101,6 @@ def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltag
     assert_allclose(exact, twice, rtol=1e-5, atol=1e-4 * np.abs(twice).max())
     assert_allclose(jax.jacrev(lambda t: f(t)["steepest_slope"])(theta), exact, rtol=1e-9, atol=1e-9)
     assert np.abs(exact).max() > 1
-
-
-@pytest.mark.slow
-def test_derivatives_are_sound_without_optimizations_as_the_command_line_compiles():
-    """The test above once more, in a process of its own. By LLVM's quick selection they were NaN."""
-    code = (
-        f"import pytest; ended = pytest.main(['-q', {__file__!r}, '-k', 'finite_differences and 2.5-2.0'])\n"
-        "from mmrjax.compile.compiling import SELDOM; assert SELDOM['xla_backend_optimization_level'] == 0 == ended"
-    )
-    environment = {**os.environ, "XLA_FLAGS": SOUND_AT_LEVEL_0}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout
-
-
-@pytest.mark.slow
-def test_steepest_slope_of_a_batch_is_that_of_each(robot):
-    conditions = Conditions(np.array([0, 1, 0]), np.array([15.0, 24.0, 6.0]), payload=np.array([0.0, 3.0, 8.0]))
-    batch = jax.vmap(lambda c: steepest_slope.compute(robot, c))(conditions)
-    each = [steepest_slope.compute(robot, jax.tree.map(lambda x, k=k: x[k], conditions)) for k in range(3)]
-    assert_allclose(batch["steepest_slope"], [float(e["steepest_slope"]) for e in each], rtol=1e-12)
 
 
 # --- the start ----------------------------------------------------------------------------------------------------

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from calibration.data.runs import Runs
-from calibration.discovery.loop_notes import MissedChannel, MissingEffect, VerdictSummary
-from calibration.discovery.verdict import missed_channels, remaining_errors, unused_inputs
+from calibration.discovery.loop_notes import MissedChannel
+from calibration.discovery.verdict import missed_channels, remaining_errors
 from calibration.inference.blocks import predictable_blocks
 from calibration.inference.observers import Histories
-from calibration.words.loop_words import verdict_sentences
 from mmrjax.model.channels import find_channel
 
 ROWS, SD = 40, 0.02
@@ -95,25 +94,3 @@ def test_a_run_without_others_is_held_out_in_parts_of_its_time(configurations, m
     quarters = np.tile(np.repeat(np.arange(4), samples // 4), len(configurations))
     assert list(kinds) == ["part"]
     np.testing.assert_array_equal(np.argmax(list(kinds["part"].values()), 0), quarters)
-
-
-def test_the_first_sentence_has_the_error_that_remains():
-    law = MissingEffect(("windage",), (), ("loss torque that changes with speed",))
-    said = verdict_sentences(
-        VerdictSummary("named", 0.002, None, (law,), missed=(MissedChannel("total_current", 0.104, 0.0),))
-    )
-    assert "it still misses total current by 10 % of its measured rms on unseen runs" in said.split(". ")[0]
-
-
-def test_what_to_check_first_is_said_with_the_columns_that_are_not_used():
-    extras = {"brake_Nm": np.linspace(0, 1, 4), "constant": np.ones(4), "who": np.array(list("abab"))}
-    assert unused_inputs(Runs("runs.csv", {"order": np.arange(4.0)}, extras=extras)) == ("brake_Nm",)
-    missed = (MissedChannel("total_current", 0.484, 0.02),)
-    said = verdict_sentences(
-        VerdictSummary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",))
-    )
-    assert said == (
-        "This model does not describe these runs: after the refit, it misses total current by 48 % of its measured "
-        "rms. Check first: unused columns that vary (brake_Nm), and parameters far from "
-        "their priors (motor.r), and units, signs and sides of columns."
-    )

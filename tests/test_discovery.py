@@ -103,18 +103,6 @@ def test_reading_that_stands_alone_is_an_outlier(clean, looks):
     assert found.rms["before"]["speed"] < 2 * np.max(clean.runs["speed_sd_mm_s"]), found.rms
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("looks", ["many"], indirect=True)
-def test_rows_that_bend_the_fit_are_set_aside(clean, looks):
-    wrong = clean.runs.where(np.arange(4))
-    wrong.columns["slope_deg"][:2] = 44.0
-    wrong.columns["payload_kg"][2:], wrong.columns["total_mass_kg"][2:] = 90.0, 103.0
-    found = looks.analyst.trace(joined(clean.runs, wrong))
-    outliers, unusable = set_aside(found)
-    assert found.verdict == "none"
-    assert {*outliers, *unusable} == {len(clean.runs) + k for k in range(4)}
-
-
 def test_rows_beyond_the_model_are_kept_out(clean, looks):
     rows = len(clean.runs)
     kept = clean.runs.where(np.arange(rows - 2))
@@ -137,14 +125,6 @@ def test_order_of_rows_does_not_matter(churning, looks):
     assert_allclose(found.screened.base.candidate.cost, churning.base.cost, rtol=1e-5)
     assert_allclose(found.left.scores.single, before.left.scores.single, atol=0.02)
     assert np.abs(before.left.scores.single).max() > 5
-
-
-@pytest.mark.slow  # another order of the rows gives the same too, above
-def test_same_seed_gives_the_same_numbers(clean, looks):
-    same, another = (parts(clean.runs, looks.analyst.seeded(seed).trace(clean.runs)) for seed in (0, 1))
-    np.testing.assert_array_equal(same.base.z, clean.base.z)
-    jax.tree.map(np.testing.assert_array_equal, same.left.test.null, clean.left.test.null)
-    assert not np.array_equal(another.left.test.null.single, clean.left.test.null.single)
 
 
 # --- statistics --------------------------------------------------------------------------------------

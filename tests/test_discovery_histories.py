@@ -18,7 +18,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.score_tests import bootstrap_statistics
-from calibration.discovery.settings import WITHOUT_NAME, settings_for
+from calibration.discovery.settings import settings_for
 from calibration.discovery.standing import judge_names
 from calibration.inference import noise
 from calibration.inference.bases import BALANCES, Basis
@@ -83,15 +83,6 @@ def oval():
 
 
 @pytest.mark.nightly
-def test_clean_histories_lack_nothing(clean):
-    found = clean.traced
-    assert found.verdict == "none" and found.screened.outliers == found.screened.base.unusable == ()
-    assert clean.left.test.p_value > 0.05
-    readings = 3 * len(clean.runs)
-    assert abs(2 * clean.base.cost - readings) < 4 * np.sqrt(2 * readings)
-
-
-@pytest.mark.nightly
 def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
     runs, label = case("pulley_eccentricity", seed=2)
     found = ANALYST.discover(runs)
@@ -119,24 +110,6 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
     strength = {order: s.explained for (order, _), s in told.orders.items()}
     assert max(strength, key=strength.get) == where.variable
     assert strength[where.variable] > 2 * strength["order 3 of the driving shaft"]
-
-
-@pytest.mark.slow
-def test_wave_without_a_name_is_in_the_result(oval):
-    """By its place alone: in a log, each run has a phase of its own."""
-    found = ANALYST.result(oval.traced, oval.runs)
-    where, location = found.summary.where, locate_discrepancy(oval.left, oval.bases, oval.space.included)
-    assert found.verdict in WITHOUT_NAME and found.effects == () and found.unnamed is None
-    assert (where.balance, where.variable) == (location.balance, location.variable)
-    assert where.explained > 0.5 * oval.label["sigmas"] ** 2
-
-
-@pytest.mark.slow
-def test_sample_that_stands_alone_is_an_outlier(clean):
-    speed = clean.runs["speed_mm_s"].copy()
-    speed[[57, 130]] += 12 * clean.runs["speed_sd_mm_s"][57]
-    found = ANALYST.discover(replace(clean.runs, columns=clean.runs.columns | {"speed_mm_s": speed}))
-    assert set(found.outliers) == {58, 131} and found.verdict == "none"
 
 
 # --- linear algebra ----------------------------------------------------------------------------------

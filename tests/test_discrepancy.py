@@ -1,6 +1,5 @@
 """Discrepancies outside the library: their curve, the robot that has it, and the formula that is proposed."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -9,15 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.random import default_rng
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from synthetic import SETTLED, table
 from test_implausible import unnamed
 from worlds import settled, tables
 
 from calibration.data.robot_file import load_robot, write_robot
-from calibration.discovery import discrepancy, outliers
+from calibration.discovery import outliers
 from calibration.discovery.discrepancy import (
-    BaseCurve,
     fit_discrepancy,
     location_columns,
     refine_window,
@@ -36,7 +34,6 @@ from calibration.words import loop_words
 from mmrjax.effects.curve import PLACES
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels
-from mmrjax.model.params import walk_parameters
 
 #: An effect that no library holds → balance and variable that it acts through.
 CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track", "payload")}
@@ -108,14 +105,6 @@ def test_curve_lowers_the_error_at_slopes_that_were_not_seen(found):
     assert after.max() < 0.5 < before.max() and np.sum(after**2) < 0.25 * np.sum(before**2)
 
 
-def test_blocks_that_are_left_out_are_not_seen(found):
-    first, problem = np.arange(len(found.runs)) < 20, found.what.problem
-    spoilt = replace(problem, data=replace(problem.data, measured=problem.data.measured.at[:20].add(1e3)))
-    a, b = (hold_out_blocks(p, found.what.z, [first]).reading for p in (problem, spoilt))
-    assert_array_equal(a, b)
-    assert np.isnan(a[20:]).all()
-
-
 def written_and_read(robot, folder):
     write_robot(robot, folder / "robot.toml", note="a discrepancy without a name")
     return load_robot(str(folder / "robot.toml"))
@@ -124,14 +113,6 @@ def written_and_read(robot, folder):
 def readings_of(robot, runs):
     reading = steady_batch(robot, runs.conditions(robot)).reading
     return jnp.stack([reading[name] for name in channels.USUAL], -1)
-
-
-def test_robot_written_and_read_gives_the_same_readings(found, tmp_path):
-    what, robot = found.what, written_and_read(found.what.robot, tmp_path)
-    assert [e.name for e in robot.effects] == [what.effect] == [f"curve_{what.balance}_{what.variable}"]
-    now, then = ({p.name: float(p.value) for p in walk_parameters(r)} for r in (robot, what.robot))
-    assert now == then
-    assert_allclose(readings_of(robot, found.runs), what.reading[: len(found.runs)], rtol=1e-10)
 
 
 def test_defect_of_each_row_shows_the_discrepancy(found):
@@ -253,22 +234,3 @@ def test_a_window_is_refined_to_its_rows():
     assert (half.low, half.high) == (15, 25)
     columns = location_columns(linear, (), DiscrepancyLocation("track", str(found), (), (), 0.0, 0.0))
     assert abs(np.corrcoef(columns[:, 0], missing)[0, 1]) == pytest.approx(1.0)
-
-
-def test_a_curve_that_several_ask_for_is_fitted_once(monkeypatch):
-    calls = []
-
-    def counted(name, *given):
-        calls.append((name, given))
-        return name
-
-    where = SimpleNamespace(place="track", variable="speed")
-    space, left = SimpleNamespace(included=None), SimpleNamespace(linear="linear")
-    monkeypatch.setattr(discrepancy, "locate_discrepancy", lambda *given: where)
-    monkeypatch.setattr(discrepancy, "fit_discrepancy", lambda *given: counted("curve", *given))
-    monkeypatch.setattr(discrepancy, "diagnose_with_curve", lambda *given: counted("diagnosis", *given))
-    beside = BaseCurve(space, "base", left, "bases")
-    assert not calls  # before it is asked for
-    assert [beside.curve, beside.diagnosis, beside.curve, beside.diagnosis] == 2 * ["curve", "diagnosis"]
-    fitted = ("curve", (space, "base", "linear", "track", "speed"))
-    assert calls == [fitted, ("diagnosis", (space, "curve", "bases", left))]

@@ -73,20 +73,6 @@ def size():
     return size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
 
 
-def test_a_design_that_meets_all_that_can_be_met_is_not_red():
-    """Only a design that misses what others meet is."""
-    tables = {block.name: block for block in size().every_block if isinstance(block, Table)}
-    verdicts = [(cell.value, cell.tone) for name in ("best", "by_motor") for cell, *_ in tables[name].rows]
-    assert set(verdicts) == {("meets the others", "fair"), ("misses", "bad")}
-
-
-def test_a_terminal_has_few_lines_of_a_sizing(capsys):
-    """All tables are on the page."""
-    print_document(size(), brief=True)
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 and lines[0].startswith("RE 40 24 V") and "31,000 designs" in lines[1]
-
-
 def above_the_bench(rise):
     """The bench's rows, and what compares them with a simulation 4 % above them, the first row without one."""
     measured = read_runs("measured")
@@ -95,17 +81,6 @@ def above_the_bench(rise):
     simulated |= {c.column: error * measured[c.column] for c in measured.channels}
     simulated["status"] = np.where(np.isnan(error), "slides", "converged")
     return measured, *compare_readings(measured, simulated)
-
-
-def test_a_comparison_draws_the_band_of_stated_sds_and_names_no_other():
-    measured = read_runs("measured")
-    for columns, named in (({}, False), ({"speed_sd_mm_s": np.full(len(measured), 7.0)}, True)):
-        runs = replace(measured, columns=measured.columns | columns)
-        compared = compare_readings(runs, {**runs.columns, "status": np.repeat("converged", len(runs))})
-        (figure,) = commented(*compared).sections[0].blocks
-        assert ("Band: " in figure.caption) == named
-    bands = [axes.patches[0].get_y() for axes in figure.draw().axes]
-    assert min(bands) == bands[-1] == -14.0 and max(bands) == 0.0
 
 
 def commented(table, summary, **more):

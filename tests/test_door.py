@@ -1,16 +1,13 @@
 """The public API against the compiled equations: the same numbers, nothing computed leaf by leaf beside them."""
 
-import dataclasses
 import pickle
 
 import jax
 import jax.extend
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import mmrjax as mm
-from mmrjax import fidelities
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_batch
 
@@ -80,41 +77,3 @@ def test_nothing_is_computed_outside_of_compiled_code(robot, primitives):
         results = mm.simulate(robot, runs)
         _ = results.total_current, results.status, results.slip, results.total_mass
     assert primitives == []
-
-
-@pytest.mark.slow
-def test_chunks_and_shapes_are_made_by_compiled_code_too(robot, primitives, monkeypatch):
-    facts = dataclasses.replace(fidelities.fidelity_facts("steady"), chunk=(4, 4))
-    monkeypatch.setitem(fidelities.TABLE, "steady", facts)
-    runs = mm.Conditions(voltage=np.linspace(10.0, 30.0, 10).reshape(2, 5))
-    for _ in range(2):
-        primitives.clear()
-        current = mm.simulate(robot, runs).total_current
-    assert current.shape == (2, 5) and primitives == []
-
-
-def test_equal_fields_of_conditions_share_an_array():
-    runs = mm.Conditions(voltage=np.full(5, 24.0), adhesion=0.5)
-    assert runs.battery is runs.discharge is runs.order is runs.open is runs.slope_deg is runs.payload
-    assert runs.duty is not runs.adhesion
-    assert_array_equal(runs.adhesion, np.full(5, 0.5))
-
-
-def test_names_of_configurations_become_indices(robot):
-    words = np.array(["4W2T", "6T2A"])[np.arange(6) % 2].reshape(3, 2)
-    found = mm.Conditions(configuration=words, voltage=24.0).resolved(robot).configuration
-    assert found.tolist() == [[1, 0]] * 3
-    one = mm.Conditions(configuration="4W2T", voltage=np.full(4, 24.0)).resolved(robot).configuration
-    assert one.tolist() == [1] * 4
-    with pytest.raises(KeyError, match="no configuration 4W"):
-        mm.Conditions(configuration=["6T2A", "4W"]).resolved(robot)
-    with pytest.raises(mm.UsageError, match=r"configuration: got 4W; "):
-        mm.simulate(robot, mm.Conditions(configuration=["6T2A", "4W"]))
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 60.0])
-def test_one_bad_number_of_a_batch_is_found(robot, bad):
-    slopes = np.zeros((2, 3))
-    slopes[1, 2] = bad
-    with pytest.raises(mm.UsageError, match=rf"slope_deg\[1, 2\]: got {bad:.6g}; expected -45 to 45 deg"):
-        mm.simulate(robot, mm.Conditions(slope_deg=slopes))

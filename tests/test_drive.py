@@ -172,17 +172,6 @@ def test_drive_that_starts_rolling_remembers_as_if_it_had_long_been(robot):
     assert_allclose(memory[1], memory[0], rtol=1e-6)
 
 
-def test_drive_start_has_three_stages(drive_table8, grid):
-    """Figs. 23, 24: a current peak, slipping acceleration, steady travel, 33 V, level."""
-    for wheeled in (0.0, 1.0):
-        k = int(np.flatnonzero((grid == [wheeled, 0.0, 0.0, 33.0]).all(1))[0])
-        s = jax.tree.map(lambda x, k=k: np.asarray(x[k]), drive_table8.signals)
-        peak = s.total_current.argmax()
-        assert drive_table8.time[k, peak] < 0.05 and s.total_current[peak] > 5 * s.total_current[-1]
-        assert (s.speed_sliding > 0.02).any() and s.speed_sliding[-1] < 0.02
-        assert (s.speed <= s.speed_theoretical + 1e-9).all()
-
-
 # --- statuses, flags, battery -----------------------------------------------------------------------
 
 
@@ -276,8 +265,3 @@ def test_drive_bad_members_leave_neighbours_alone(small):
     mixed, alone = go(Conditions(**bad), 1.0), go(Conditions(**clean), 1.0)
     assert names(mixed.result)[1] == names(mixed.result)[7] == "failed"
     jax.tree.map(lambda a, b: assert_array_equal(a[::2], b[::2]), mixed.signals, alone.signals)
-
-
-def test_drive_at_the_first_instant_is_at_rest(drive_table8):
-    for name in ("current", "speed_motor", "speed", "traction", "torque_load"):
-        assert (np.asarray(getattr(drive_table8.signals, name))[:, 0] == 0).all()

@@ -4,11 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.random import default_rng
 
-from mmrjax.fidelities.drive import drive
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.signals import STATUSES
 
 pytestmark = pytest.mark.slow  # compiles for a minute
 
@@ -70,37 +67,6 @@ def test_drive_derivatives_are_central_differences(name, theta, jacobians, run_d
         scale = np.maximum(np.abs(values), np.abs(differences)).max(instants, keepdims=True) + 1e-6
         error = np.abs(forward - differences) / scale
         assert error.max() < 1e-5, np.unravel_index(error.argmax(), error.shape)
-
-
-@pytest.mark.parametrize("name", sorted(RUNS))
-def test_drive_derivatives_at_rest_are_finite(name, jacobians):
-    """The first instant, where every speed and current is zero."""
-    (values, _), (forward, _) = jacobians[name]
-    assert TIMES[0] == 0 and np.isfinite(forward[:, 0]).all() and np.isfinite(values[:, 0]).all()
-
-
-@pytest.mark.slow
-def test_drive_bad_members_leave_neighbours_derivatives_alone(rebuild, theta, scales):
-    """Along one direction in which every parameter moves."""
-    keep, times = jnp.arange(6) % 2 == 0, jnp.linspace(0.0, 0.5, 3)
-    direction = jnp.asarray(scales * default_rng(6).normal(size=scales.size))
-
-    @jax.jit
-    def slope(runs):
-        def total(vector):
-            result = jax.vmap(lambda c: drive(rebuild(vector), c, times).result)(runs)
-            return {name: jnp.where(keep, x, 0.0).sum() for name, x in result.reading.items()}, result.status
-
-        _, tangent, status = jax.jvp(total, (theta,), (direction,), has_aux=True)
-        return tangent, status
-
-    clean, _ = slope(Conditions(voltage=[15.0, 20.0, 24.0, 28.0, 33.0, 33.0]))
-    mixed, status = slope(Conditions(voltage=[15.0, np.nan, 24.0, 0.0, 33.0, 33.0], payload=[0, 0, 0, 0, 0, -13.1]))
-    assert STATUSES[int(status[1])] == "failed"
-    still = {name for name, x in clean.items() if x == 0}
-    assert np.isfinite([*clean.values()]).all()
-    assert still == {"lateral_speed", "yaw_rate", "yaw", "place_x", "place_y"}
-    assert mixed == clean
 
 
 # --- no parameter that can be freed is dead ---------------------------------------------------------

@@ -7,12 +7,11 @@ from numpy.testing import assert_allclose
 
 from calibration.data.effect_file import _check_effect, effect_library
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.robot_file import add_effects, load_robot, read_robot, write_robot
+from calibration.data.robot_file import load_robot, read_robot, write_robot
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.paper_robots import nominal
 from tests.commands import read_rig, text_file
 
 GOOD = '''
@@ -99,13 +98,6 @@ def test_user_effect_states_what_the_library_states(tmp_path):
     power = GOOD.replace("signals.direction", "signals.direction * signals.battery")
     text = power.replace("    dissipative = True\n", "    needs_battery = True\n")
     assert effect_library([written(tmp_path, text, "on_battery.py")])["seal_drag"].needs_battery
-
-
-def test_user_effect_may_settle_to_another_of_the_users(tmp_path):
-    one = stating('settles_to = "seal_wear"')
-    two = GOOD.replace("SealDrag", "SealWear")
-    library = effect_library([written(tmp_path, one), written(tmp_path, two, "other.py")])
-    assert library["seal_drag"].settles_to == "seal_wear"
 
 
 REFUSED = {
@@ -223,27 +215,3 @@ def test_robot_file_names_the_configurations_of_an_effect(tmp_path):
     assert "configurations" in (tmp_path / "again.toml").read_text()
     again = read_robot(tmp_path / "again.toml")
     assert [e.configurations for e in again.effects] == [("4W2T",), ()]
-
-
-def test_robot_file_may_undo_the_configurations_of_a_class(tmp_path):
-    library = effect_library([written(tmp_path, stating('configurations = ("4W2T",)'))])
-    robot = add_effects(nominal(), ("seal_drag",), library)
-    assert robot.effects[0].configurations == ("4W2T",)
-    robot = add_effects(nominal(), ("seal_drag",), library, {"seal_drag": []})
-    assert robot.effects[0].configurations == ()
-    write_robot(robot, tmp_path / "robot.toml")
-    assert read_robot(tmp_path / "robot.toml", library).effects[0].configurations == ()
-
-
-@pytest.mark.parametrize(
-    "value, sentence",
-    [
-        ('["4W2"]', r"got 4W2; did you mean 4W2T\? allowed: 6T2A, 4W2T$"),
-        ('["6T2A", "8W"]', r"got 8W; allowed: 6T2A, 4W2T$"),
-        ('"4W2T"', r"got '4W2T'; expected a list of 6T2A, 4W2T$"),
-        ("[1]", r"got \[1\]; expected a list of 6T2A, 4W2T$"),
-    ],
-)
-def test_wrong_configurations_of_an_effect_are_refused(tmp_path, value, sentence):
-    with pytest.raises(BadConfiguration, match=r"mine\.toml, effects\.mass_offset\.configurations: " + sentence):
-        read_rig(tmp_path, f"[effects.mass_offset]\nconfigurations = {value}\n", "mine.toml")

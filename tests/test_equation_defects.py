@@ -2,22 +2,16 @@
 was found is drawn over what it depends on."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
-import mmrjax as mm
-from calibration.inference.details import EquationErrors
 from calibration.inference.observers.settled import EQUATIONS, SettledLinearization, _row_defects
 from calibration.inference.observers.turns import TurnLinearization
-from mmrjax import effects
-from mmrjax.model import channels
 from mmrjax.model.signals import Signals
-from sweeps.commands import loop as page
-from sweeps.pages.loop_figures import _defect_variable, conditions_and_readings, draw_defects, driving_variable
+from sweeps.pages.loop_figures import driving_variable
 
 ROWS, COUNT, RANDOM = 12, 3, default_rng(0)
 #: Sizes of voltage, torque and speed; and how many sds of a reading a defect of that size is.
@@ -122,42 +116,3 @@ def test_what_was_found_is_drawn_over_what_it_depends_on(change, label):
     y[3] = np.nan  # a row that does not count
     x, said = driving_variable(table, y)
     assert said == label and x.shape == y.shape
-
-
-def test_voltage_of_a_side_is_its_share_of_the_supply():
-    table = turns()
-    given = table["supply_voltage_V"] * table["duty_left"]
-    assert np.array_equal(conditions_and_readings(table)["voltage, left [V]"], given)
-
-
-def test_where_a_driver_passes_on_a_share_of_one_voltage_that_is_the_axis():
-    duty = RANDOM.uniform(-1, 1, 8)
-    table = {"configuration": np.full(8, "rig"), "supply_voltage_V": np.full(8, 48.0), "duty": duty}
-    for x, label in (
-        driving_variable(table, duty**3),
-        _defect_variable(table, "slope_deg", "slope [deg]"),
-    ):
-        assert np.array_equal(x, 48.0 * duty) and label == "voltage given to the motors [V]"
-
-
-def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
-    table = turns()
-    fig = draw_defects(table, "none", crosses_zero=True)
-    for axes, quantity in zip(fig.axes, ("current_{}_A", "speed_{}_rpm", "speed_{}_rpm"), strict=True):
-        lines = {line.get_label(): line.get_xdata() for line in axes.get_lines()}
-        for side in SIDES:
-            assert np.array_equal(lines[f"6T2A, {side}"], table[f"motor_{quantity.format(side)}"])
-        assert "of that side" in axes.get_xlabel()
-
-
-def test_change_of_a_reading_that_crosses_zero_is_of_its_size(monkeypatch):
-    """A turn's yaw rate may be next to nothing. What an effect changes of it is no share of that."""
-    robot = replace(mm.nominal(), effects=(effects.BY_NAME["iron_loss"](amplitude=1.0),))
-    rates = [np.array([1.0, -1.0, 1e-9]), np.array([1.1, -1.1, 0.1])]
-    monkeypatch.setattr(page.mm, "simulate", lambda *_: SimpleNamespace(yaw_rate=rates.pop(0)))
-    found = SimpleNamespace(
-        effects=[SimpleNamespace(name="iron_loss")], robot=robot, detail=EquationErrors({}, {}), included=np.ones(3, bool),
-        channels=channels.channels_named(["yaw_rate"]), runs=SimpleNamespace(conditions=lambda robot: None),
-        readings_of_rows=SimpleNamespace(measured=np.array([[1.0], [-1.0], [0.0]])),
-    )  # fmt: skip
-    assert page.changes_by_effect(found)["iron_loss"].rms == pytest.approx(10 * np.sqrt(1.5), rel=1e-6)

@@ -38,9 +38,3 @@ def test_channel_errors_leave_out_what_is_missing():
     assert np.isnan(found["motor_speed"]["rms_percent"])
     assert found["total_current"]["rms"] == pytest.approx(np.sqrt(0.5))
     assert found["speed"]["rms"] == pytest.approx(0.1 / 1e-3)  # in mm/s, as the column
-
-
-def test_channel_errors_take_another_percentage():
-    one = np.ones((2, 3))
-    found = channel_errors(usual_channels(), one, one, one, percent=np.full((2, 3), -7.0))
-    assert found["speed"]["rms_percent"] == 7.0 and found["speed"]["rms_sigma"] == 0.0

@@ -9,14 +9,10 @@ import weakref
 
 import numpy as np
 import pytest
-from typer.main import get_command
 
 from sweeps import cli
 from sweeps.pages import words
 from sweeps.points import run
-from tests.commands import ROOT
-
-DOCS = ROOT / "docs"
 
 
 @pytest.mark.quick(1)
@@ -99,18 +95,3 @@ def test_an_interrupt_within_a_callback_is_obeyed(monkeypatch, capsys):
     signal.signal(signal.SIGINT, ignored)
     assert end.value.code == 130 and time.monotonic() - begun < 4 and sys.unraisablehook is hook
     assert capsys.readouterr().err == "mmrjax: interrupted; no run folder was written\n"
-
-
-def test_every_command_says_what_3_means_and_the_docs_have_its_words():
-    text = (DOCS / "reference/exit-codes.md").read_text(encoding="utf-8")
-    documented = {}
-    for line in text.splitlines():
-        if line.startswith("| `"):
-            names, _, meaning = line.strip("| ").partition(" | ")
-            documented |= {name.strip("` "): meaning for name in names.split(",")}
-    said = {
-        name: command.epilog.partition("Exit code 3: ")[2].removesuffix(".")
-        for name, command in get_command(cli.app).commands.items()
-        if "Exit code 3" in (command.epilog or "")
-    }
-    assert said == documented and all(said.values()) and {"simulate", "sweep", "loop", "check"} <= set(said)

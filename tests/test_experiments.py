@@ -1,6 +1,5 @@
 """The next experiment: what the menu foresees, which experiment is chosen, and what its readings say."""
 
-import types
 from dataclasses import replace
 
 import equinox as eqx
@@ -14,13 +13,10 @@ from synthetic import SETTLED, table
 from test_worlds_tables import SHAPES
 from worlds import laws, settled, tables
 
-from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import change_robot
-from calibration.described import describe
-from calibration.discovery import assembly, experiments, menu
+from calibration.discovery import experiments, menu
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates
 from calibration.discovery.classes import Classes, Shift
-from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.predicted import (
     batch_experiments,
     map_over_runs,
@@ -35,7 +31,6 @@ from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.rig import Rig
 from sweeps.stage_files import read_stage, write_stage
 from tests.commands import read_rig
 
@@ -97,20 +92,6 @@ def test_menu_agrees_with_the_generators_own_physics(name, shown):
         theirs, sound = settled.carried_out(BY[experiment_name], p, [] if term is None else [term])
         assert_array_equal(there[at], sound, err_msg=experiment_name)
         assert_allclose(value[at][sound], theirs[sound], rtol=1e-6, atol=1e-9, err_msg=experiment_name)
-
-
-def test_menu_and_generator_have_the_same_instruments():
-    case = tables.Case({}, {}, None, settled.conditions(0, 1, 0, 0), settled.CLIMBING, (), settled.Instruments())
-    sd = reading_sds(MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True)))
-    for name, at in SPANS.items():
-        assert_allclose(case.carry_out(BY[name], 0)["sd"], sd[at], err_msg=name)
-
-
-def test_reverse_travel_turns_the_sign_of_a_biased_slope_alone(shown):
-    at = SPANS
-    plain, biased = (shown(settled.CLIMBING, laws.Term("slope_bias", a))[0] for a in (0.0, 0.02))
-    change = biased - plain
-    assert change[at["reverse, 6T2A"]][0] < 0 < change[at["downhill, 6T2A"]][0]  # of the current
 
 
 # --- the choice -------------------------------------------------------------------------------------
@@ -206,15 +187,6 @@ def test_the_experiment_is_the_one_of_least_effort_that_tells_most(sigma, chosen
         assert proposal.separates == ("b", "c")
 
 
-@pytest.mark.slow
-def test_alternatives_that_agree_give_none_and_an_unaffected_experiment_separates_nothing(seen):
-    _, space, fitted, foreseen = seen["series_resistance", "supply_sag"]
-    same = dict.fromkeys(("one", "the other"), next(iter(fitted.values())))
-    proposal = experiments.choose_experiment(experiments.predict_menu(space, same, SETTINGS))
-    assert (proposal.name, proposal.expected_sigma, proposal.separates) == (experiments.NONE, 0, ())
-    assert foreseen.apart(0, 1, "weigh") == foreseen.apart(0, 1, "zero current") == 0
-
-
 def candidates(*names):
     return tuple(
         Candidate((n,), np.zeros(1), np.zeros(1), float(k), np.zeros(1), np.zeros(1), True, True, True)
@@ -247,28 +219,6 @@ def test_alternatives_of_two_classes_differ_in_one_effect():
     )
     left = experiments.alternatives_of_class(made[0], of_members(("a", "c"), ("b", "d"), ladder=made))
     assert list(left) == ["a + b", "c + b", "d + a"]
-
-
-@pytest.mark.slow
-def test_nothing_is_proposed_where_one_name_is_left(seen):
-    space = seen["mass_error", "tension_friction"][1]
-    (best,) = candidates("mass_error")
-    assert experiments.propose_separating(space, best, of_members(("mass_error",), ladder=(best,)), SETTINGS) is None
-
-
-@pytest.mark.slow
-def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
-    space = seen["mass_error", "tension_friction"][1]
-    where = DiscrepancyLocation("track", "speed", ("track",), (), 60.0, 60.0)
-
-    def proposed(**changes):
-        return experiments.propose_denser_runs(space, replace(where, **changes), SETTINGS)
-
-    strong, weak, wave = proposed(), proposed(strongest=4.0), proposed(variable="order 2 of the driving shaft")
-    assert "speed" in strong.name and strong.instruction.place == "track" and int(space.included.sum()) == 90
-    assert strong.expected_sigma == pytest.approx(np.sqrt(60 * 45 / 90))
-    assert (weak.instruction.variable, weak.name, weak.expected_sigma) == ("speed", experiments.NONE, 0)
-    assert wave.name == "steady speeds for order 2 of the driving shaft"
 
 
 # --- what is within reach ---------------------------------------------------------------------------
@@ -329,35 +279,6 @@ def test_menu_stays_within_the_reach_of_a_small_robot(rover):
     assert payloads.max() == 1.5 and slopes.max() <= 9.5 and slopes.min() == -8.0
     assert named(made, "weigh").at == ((0.0, 0.0), (0.0, 1.0))
     assert max(named(runs, "stall").voltage) / 1.2 < 3.0  # of the current of steady travel, not of 12 V / 1.2 ohm
-
-
-@pytest.mark.slow
-def test_configurations_without_rows_are_not_on_the_menu():
-    made = menu.experiment_menu(reach(CLIMBING, conditions(settled.table8(configurations=(1,)))))
-    assert not any("6T2A" in e.name for e in made) and {r.used and r.used.configuration for r in runs_of(made)} == {
-        None,
-        "4W2T",
-    }
-    assert {r.configuration for r in runs_of(made) if "4W2T" in r.kinds} == {1}
-    assert named(made, "weigh").at == ((1.0, 0.0), (1.0, 8.0))
-
-
-@pytest.mark.slow
-def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
-    made = menu.experiment_menu(reach(rover, LEVEL))
-    runs = runs_of(made)
-    assert all(set(r.slope) <= {0.0, -0.0} and set(r.payload) == {0.0} and max(r.voltage) <= 12.0 for r in runs)
-    assert not {"downhill", "steepest slope", "payload"} & {k for r in runs for k in r.kinds}
-    assert made[0].name == "weigh" and {m for _, m in made[0].at} == {0.0}
-
-
-@pytest.mark.slow
-def test_higher_voltage_needs_a_rating_and_is_watched(rover):
-    within = reach(change_robot(rover, {"motor.voltage_limit": 18.0}, where="test"))
-    run = named(menu.experiment_menu(within), "other voltages, rover")
-    assert max(run.voltage) == 18.0
-    shown = menu.restrict_run(run, *plain(run))
-    assert Remark("overvoltage", voltage=18.0, used=12.0) in shown.watch
 
 
 @pytest.mark.parametrize(
@@ -435,18 +356,6 @@ def test_only_levels_that_the_robot_manages_are_left():
     assert menu.possible_runs(steepest, np.array([False, True, True])).tolist() == [False, True, False]
 
 
-@pytest.mark.slow
-def test_steepest_slope_is_one_that_the_robot_climbs():
-    slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
-    does = np.asarray(eqx.filter_jit(foreseen)(slippery, batch_experiments(MENU, channels.USUAL)).does)
-    kept, first = {}, 0
-    for run in runs_of(MENU):
-        rows = slice(first, first := first + len(run.voltage))
-        kept[run.name] = menu.possible_runs(run, does[rows])
-    # tan 21.5 deg = 0.394 and rolling resistance: beyond the adhesion
-    assert not kept["steepest slope, 6T2A"].any() and kept["lifted, 6T2A"].all()
-
-
 @pytest.mark.parametrize("name, temperature, speed, watch", [
     ("stall", 90.0, 0.0, Remark("held_motor", temperature=90.0, allowed=125.0,
                                 current=max(BY["stall"].voltage) / REACH.resistance)),
@@ -460,13 +369,6 @@ def test_what_can_do_damage_is_to_be_watched(name, temperature, speed, watch):
     run = BY[name]
     found = menu.restrict_run(run, *plain(run, temperature, speed)).watch
     assert watch in found if watch else found == ()
-
-
-def test_every_kind_is_on_the_packaged_menu_and_no_other():
-    metered = menu.experiment_menu(replace(REACH, measured=("motor_current",)))
-    braked = menu.experiment_menu(replace(REACH, has_ground=False, torques=(0.0, 0.5)))
-    kinds = {k for e in (*MENU, *metered, *braked) for k in e.kinds}
-    assert kinds == {*menu.KINDS, "6T2A", "4W2T"}
 
 
 def test_runs_against_a_brake_have_its_torque():
@@ -484,14 +386,6 @@ def test_runs_against_a_brake_have_its_torque():
     kept = menu.restrict_run(run, menu.possible_runs(run, done), *plain(run)[1:])
     assert set(kept.torque) == set(run.torque) - {0.5} and len(kept.voltage) == len(kept.torque)
     assert conditions_of(menu.experiment_menu(replace(within, torques=()))).load_torque is None
-
-
-def test_unknown_experiments_are_refused_with_the_choices():
-    menu.check_forbidden(("stall", "one motor", "4W2T"), CLIMBING)
-    with pytest.raises(
-        BadConfiguration, match="--forbid stal: no such experiment or configuration; did you mean stall"
-    ):
-        menu.check_forbidden(("stal",), CLIMBING)
 
 
 @pytest.mark.slow
@@ -520,14 +414,3 @@ def test_every_experiment_is_kept_in_a_stage(tmp_path):
     write_stage(tmp_path / "menu", MENU)
     assert read_stage(tmp_path / "menu") == MENU
     assert {type(e) for e in MENU} == {menu.CalibrationAct, menu.ProposedRuns}
-
-
-def test_a_class_of_a_servos_log_has_no_experiment_of_the_menu():
-    """The menu has no runs with a goal: the loop ended in an IndexError once effects of a servo were inseparable."""
-    seen = types.SimpleNamespace(menu=True, word="sample")
-    base = types.SimpleNamespace(rig=Rig(imposed="goal_angle"))
-    space = types.SimpleNamespace(bare=types.SimpleNamespace(observe=seen, base=base))
-    traced = types.SimpleNamespace(verdict="class", where=None, alike=object())
-    proposal = assembly._next_experiment(space, traced, None)
-    assert proposal.experiments == (experiments.NONE,)
-    assert describe(proposal.instruction).endswith("no experiments for goals of a controller")

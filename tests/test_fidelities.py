@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import types
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -103,43 +102,6 @@ def test_fidelity_keeps_the_contract(name, law, robot):
     law(fidelity, robot)
 
 
-def _one_row(robot, conditions):
-    return operating_point(robot, jax.tree.map(lambda x: x[0], conditions))[0]
-
-
-def _no_readings(robot, conditions, options, progress=None):
-    return RunBatch(replace(steady_batch(robot, conditions), reading={}))
-
-
-def _from_the_middle(robot, conditions, options, progress=None):
-    kept = fidelities.get_fidelity("drive").histories(robot, conditions, {"duration": 2 * SHORT})
-    return kept
-
-
-@pytest.mark.parametrize(
-    "law, of, change",
-    [
-        (knows_itself, "steady", {"histories": _from_the_middle}),
-        (settles_traceably, "steady", {"settled": _one_row}),
-        (runs_batches, "steady", {"run": _no_readings}),
-        pytest.param(keeps_histories, "drive", {"histories": _from_the_middle}, marks=pytest.mark.slow),
-    ],
-    ids=["knows_itself", "settles_traceably", "runs_batches", "keeps_histories"],
-)
-def test_contract_can_be_broken(law, of, change, robot):
-    with pytest.raises(AssertionError):
-        law(replace(fidelities.get_fidelity(of), **change), robot)
-
-
-@pytest.mark.slow
-def test_settled_gives_numbers_where_the_robot_slides(robot):
-    runs = Conditions(voltage=24.0, slope_deg=[20.0])
-    for name in ("steady", "drive"):
-        settled = fidelities.get_fidelity(name).settled(robot, runs)
-        assert STATUSES[int(settled.status[0])] == "slides"
-        assert all(np.isfinite(reading).all() for reading in settled.reading.values())
-
-
 # --- a new one --------------------------------------------------------------------------------------
 
 
@@ -192,25 +154,3 @@ def test_new_fidelity_is_a_file_and_a_line(toy, robot):
 def test_facts_need_no_jax_and_steady_no_mujoco(code, absent):
     code += "; import sys; assert not set(sys.argv[1:]) & set(sys.modules), set(sys.modules)"
     subprocess.run([sys.executable, "-c", code, *absent.split()], cwd=ROOT, check=True, timeout=120)
-
-
-@pytest.mark.parametrize(
-    "name, given, message",
-    [
-        ("steady", {"duration": 5.0}, "duration: got 5.0; this fidelity has the options: none"),
-        ("drive", {"step": 1e-4}, "step: got 0.0001; this fidelity has the options: duration"),
-        ("drive", {"duration": 0.0}, "duration: got 0; expected more than 0, at most 86400 s"),
-        ("track", {"step": 0.1}, "step: got 0.1; expected more than 0, at most 0.01 s"),
-        ("track", {"duration": float("nan")}, "duration: got nan; expected more than 0, at most 3600 s"),
-    ],
-)
-def test_options_are_refused_in_words(name, given, message):
-    with pytest.raises(ValueError) as refused:
-        fidelities.fidelity_facts(name).resolved(**given)
-    assert str(refused.value) == message
-
-
-def test_unknown_fidelity_lists_those_there_are():
-    for ask in (fidelities.get_fidelity, fidelities.fidelity_facts):
-        with pytest.raises(KeyError, match="no fidelity fast; there are steady, drive, track"):
-            ask("fast")

@@ -210,10 +210,3 @@ def test_names_in_files_of_every_format_reach_no_terminal(mmrjax, tmp_path, file
     (tmp_path / file).write_bytes(content[: len(content) // 2].replace(b"0", b"\x1b[31m"))  # damaged
     code, out, err = mmrjax("inspect", file)
     assert code in (0, 4) and not obeyed(out + err)
-
-
-@pytest.mark.parametrize("words", ["inspect surr.json", "inspect surr.json --json"])
-def test_half_a_surrogate_pair_is_shown_replaced(mmrjax, tmp_path, words):
-    (tmp_path / "surr.json").write_text('[{"\\ud800": 1, "t": 2}]')
-    code, out, err = mmrjax(words)
-    assert code in (0, 4) and "Traceback" not in err and not obeyed(out + err)

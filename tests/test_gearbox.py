@@ -26,13 +26,6 @@ def test_gearbox_laws_match_reference():
         assert_allclose(gear.torque_output(torque - idle, 1.0), paper.gear_output(torque, loss, i), rtol=1e-9)
 
 
-def test_gearbox_without_losses_is_a_lever():
-    gear = Gearbox(ratio=30.0, efficiency_load=1.0, friction_coulomb=0.0, friction_viscous=0.0)
-    assert float(gear.torque_output(0.02, 1.0)) == 30.0 * 0.02
-    assert float(gear.torque_loss(0.02, 500.0)) == 0.0
-    assert float(gear.efficiency(0.02, 500.0)) == 1.0
-
-
 def test_gearbox_efficiency_at_zero_torque_is_finite_with_its_gradient():
     value, gradient = jax.value_and_grad(Gearbox().efficiency)(0.0, 800.0)
     assert np.isfinite(value) and np.isfinite(gradient)

@@ -22,8 +22,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
 from mmrjax.model.signals import STATUSES
-from sweeps.commands import rig_check
-from tests.commands import csv_text, read_rig, text_file
+from tests.commands import read_rig
 
 AMPERES = np.array([-8.0, -2.0, 0.5, 5.0])
 #: Friction of motor (N·m) and efficiency of `bench`; its load has none here.
@@ -139,14 +138,6 @@ def test_a_gearbox_that_loses_nothing_by_its_file_has_no_effect(tmp_path):
     assert applies == [False, True]
 
 
-@pytest.mark.slow
-def test_a_locked_rotor_with_voltage_alone_gives_the_resistance(tmp_path):
-    robot, columns = rig(tmp_path, "voltage", '"motor_current"'), table()
-    rows = {"supply_voltage_V": columns["motor_voltage_V"], "motor_current_A": CURRENT, "held": columns["held"]}
-    found = mm.calibrate(read_runs(rows, robot=robot), robot, free=("motor.resistance",))
-    assert found.parameters["motor.resistance"].value == pytest.approx(0.25, rel=0.01)
-
-
 def test_a_clamp_with_another_model_is_refused(tmp_path):
     robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     with pytest.raises(BadConfiguration, match="held: got model drive; expected steady"):
@@ -245,13 +236,3 @@ def test_a_clamp_in_a_log_of_an_elastic_joint_is_refused(tmp_path):
     runs = read_runs({**log, "held": np.r_[np.zeros(4), np.ones(5)]}, robot=robot)
     with pytest.raises(BadConfiguration, match="a clamp on a load with backlash or an elastic joint"):
         Histories.of(runs, robot)
-
-
-def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):
-    rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
-    columns = {"motor_speed_rpm": 0 * CURRENT, "motor_current_A": CURRENT, "motor_voltage_V": 0.25 * CURRENT}
-    columns["load_torque_Nm"] = 0.6 * CURRENT + 0.01 * np.arange(16)
-    table = text_file(tmp_path / "runs.csv", csv_text(columns))
-    assert rig_check.check_rig_file(tmp_path / "rig.toml", str(table), (), False) == 0
-    printed = capsys.readouterr().out
-    assert "These data determine" in printed and "some rows have no steady state" not in printed

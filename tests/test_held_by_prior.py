@@ -2,7 +2,6 @@
 
 import functools
 import json
-import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +21,6 @@ from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.identifiability import HELD, held_by_prior
 from mmrjax.model import paper_robots
 from sweeps.report import calibration_report, page_renderer
-from sweeps.report.terminal_renderer import print_document
 
 
 def linear(jacobian):
@@ -95,7 +93,7 @@ def found(case):
 @pytest.mark.parametrize(
     "case", [pytest.param(c, marks=[pytest.mark.slow] * (c != "packaged")) for c in CALIBRATIONS]
 )
-def test_calibration_says_it_of_every_parameter_everywhere(case, capsys, tmp_path):
+def test_calibration_says_it_of_every_parameter_everywhere(case, tmp_path):
     made = found(case)
     held = {name for name, p in made.parameters.items() if np.sqrt(p.variance_ratio) > HELD}
     sd = np.sqrt(np.diag(made.posterior.covariance))  # of coordinates whose prior sd is 1
@@ -107,11 +105,6 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, capsys, tmp_pat
     far = {note.name for note in remarks_with_codes(made.remarks, "far_from_prior")}
     assert set(listed) == held - far and len(listed) == len(set(listed))
     shown = calibration_report.calibration_document(made, "nominal")
-    print_document(shown)
-    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-    lines = {line.split()[0]: line for line in lines if line and line.split()[0] in made.parameters}
-    assert set(lines) == set(made.parameters)
-    assert {name for name, line in lines.items() if re.search(r" no(, (lower|upper) bound)?$", line)} == held
     page = Tables(page_renderer.write_report_page(tmp_path, shown).read_text("utf-8"))
     head, *rows = page.tables["parametertable"]
     assert {row[0] for row in rows if row[head.index("determined")].startswith("no")} == held

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
 from mmrjax.effects import BY_NAME
@@ -85,19 +84,6 @@ def test_derivatives_are_those_of_what_is_computed(changes):
         scale, error = (np.abs(x).max((0, 1)) for x in (expected, slope - expected))
         assert (scale > 0).any(), name
         assert (error <= 2e-3 * scale + 1e-9 * np.abs(high).max((0, 1)) / by).all(), name
-
-
-@pytest.mark.slow
-def test_repeated_instants_change_nothing(robot):
-    short, long = GRID[:120], np.concatenate([GRID[:120], np.repeat(GRID[119], 7)])
-    one = jax.tree.map(lambda x: x[0], RUNS)
-    first, second = (
-        ravel_pytree(jax.tree.map(lambda x: x[119], history_signals(robot, one, jnp.asarray(g))))[0]
-        for g in (short, long)
-    )
-    np.testing.assert_array_equal(first, second)
-    last = history_signals(robot, one, jnp.asarray(long)).speed_motor
-    assert_allclose(last[120:], last[119], rtol=1e-12)
 
 
 def test_run_that_cannot_be_followed_is_not_finite(robot):

@@ -11,7 +11,7 @@ from test_stated_values import LOOKS
 from worlds import laws, settled, tables
 
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.findings import _alternative, found_effects, listed_alternatives
+from calibration.discovery.findings import listed_alternatives
 from calibration.discovery.search import search_effects, single_p_value
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.linearization import amplitude_of
@@ -90,20 +90,6 @@ def test_heating_three_times_too_large_is_unnamed_and_said(hot):
     assert first.effects["winding_heating"] == pytest.approx(3.0 * LARGEST, rel=0.1)
 
 
-def test_companions_that_explain_nothing_are_not_listed(hot):
-    """Of pairs with the heating none is left, and of each effect that is ruled out it is said why, of it alone."""
-    _, ruled_out = listed(hot, min(c.cost for c in hot.searched.ladder))
-    assert [list(a.effects) for a in ruled_out] == [["winding_heating"]]
-    pairs = [c for c in hot.searched.ladder if len(c.effects) == 2 and "winding_heating" in c.effects]
-    assert len(pairs) > 3  # there were some
-    space = hot.screened.base.space
-    for c in pairs:
-        why = {r.name for r in _alternative(space, c, 0.0, SETTLED.settings).reasons}
-        for name, size in zip(c.effects, c.size, strict=False):
-            if 0 < size < 0.3 and not (space.library[name].dissipative and c.amplitude[c.active.index(name)] <= 0):
-                assert name not in why
-
-
 def made(*effects, slots, cost, plausible=True):
     active = (*effects, *("",) * (slots - len(effects)))
     size = np.where([bool(n) for n in active], 0.1 if plausible else 2.0, 0.0)
@@ -136,26 +122,6 @@ def test_own_p_is_the_share_of_tables_whose_strongest_effect_explains_as_much():
     null = np.array([1.0, 2.0, 3.0, 4.0])
     assert single_p_value(9.0, null) == pytest.approx(3 / 5) and single_p_value(100.0, null) == pytest.approx(1 / 5)
     assert single_p_value(0.0, null) == 1.0
-
-
-@pytest.mark.parametrize(
-    "names, sigmas",
-    [(["stribeck_track", "gear_load_loss"], 9.0), (["churning", "mass_offset"], 9.0), (["series_resistance"], 25.0)],
-)
-def test_named_effects_are_of_a_sign_and_a_strength_of_their_own(names, sigmas):
-    """Whatever stands beside a strong effect: none gives power, none is at a bound, each has a p of its own."""
-    traces = [SETTLED.trace(table(tables.narrow(names, sigmas, seed))) for seed in range(4)]
-    seen = []
-    for found in (t for t in traces if t.alike is not None):
-        base = found.screened.base
-        seen += found_effects(base.space, base.candidate, found.best, found.alike, found.left.test, SETTLED.settings)
-        assert found.best.plausible
-    for e in seen:
-        kind, amplitude = BY_NAME[e.name], e.parameters["amplitude"].value
-        low, high = amplitude_of(kind()).spec.bounds
-        assert e.p_value <= SETTLED.settings.family_wise_error, e.name
-        assert low < amplitude < high and (not kind.dissipative or amplitude > 0), e.name
-    assert len(seen) >= 3
 
 
 def test_an_effect_without_a_p_of_its_own_is_not_proposed(looks):

@@ -1,7 +1,5 @@
 """Motors whose current is imposed: steady travel, histories, tables and fits against plain physics, without a winding."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,18 +10,15 @@ from calibration.data import unused_readings
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import doubtful_current
 from calibration.data.robot_file import read_robot, write_robot
-from calibration.discovery import loop_input
-from calibration.inference import bases, checks, observers
+from calibration.inference import bases, observers
 from calibration.inference import blocks as holdout
-from calibration.inference.calibration import calibrate
 from calibration.inference.observers import time_histories
-from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.histories import history_signals
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
 from mmrjax.model.balances import absent_balances
 from mmrjax.model.conditions import Conditions
-from tests.commands import csv_text, ends, read_rig, read_table, rows
+from tests.commands import csv_text, read_rig, read_table
 
 K, RATIO, ETA = 0.05, 10.0, 0.9
 DRY, VISCOUS, INERTIA, ROTOR = 0.3, 0.02, 0.01, 2e-6
@@ -54,13 +49,6 @@ def settles(current):
     """Speed of the motor [rad/s] at which i η k I is what the load takes."""
     torque = RATIO * ETA * K * np.abs(current) - DRY
     return np.sign(current) * RATIO * np.maximum(torque, 0.0) / VISCOUS
-
-
-def followed(current, times, dry=DRY):
-    """Speed of the motor from rest [rad/s] at a current that is held, by its first-order law."""
-    inertia = INERTIA + ETA * ROTOR * RATIO**2
-    end = RATIO * (RATIO * ETA * K * current - dry) / VISCOUS
-    return end * (1 - np.exp(-VISCOUS / inertia * times))
 
 
 def turned(current, every):
@@ -115,29 +103,6 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
         )
 
 
-@pytest.mark.parametrize("reading", ["motor_voltage_V", "motor_speed_rpm"])
-def test_a_large_current_without_a_measured_speed_may_be_that_of_a_held_shaft(tmp_path, robot, reading):
-    robot = replace(robot, rig=replace(robot.rig, channels=(reading.rpartition("_")[0],)))
-    table = read_table(tmp_path, f"motor_current_A,{reading}\n200,1\n400,2\n700,3.5\n", robot)
-    assert ("add a column held" in doubtful_current(table, robot)) == (reading == "motor_voltage_V")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("factor, doubted", [(1.0, False), (1e3, True)])
-def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor, doubted, monkeypatch):
-    current = np.array([1.0, 1.5, 2.0, -1.0, -1.5, -2.0, 1.2, 1.8])
-    columns = {"motor_current_A": factor * current, "motor_speed_rpm": 9.549 * settles(current)}
-    runs = read_table(tmp_path, csv_text(columns), robot, "runs.csv")
-    monkeypatch.setattr(checks, "check_ranges", lambda runs, robot: [])  # which refuses it where speeds show it too
-    ready = loop_input.prepare_loop(runs, robot)
-    assert any("Is it in another unit" in str(note) for note in ready.at_first) == doubted
-    said = []
-    monkeypatch.setattr(observers, "pose_problem", lambda *given: said.append("fit") or 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        calibrate(runs, robot, tell=said.append)
-    assert any("Is it in another unit" in text for text in said[: said.index("fit")]) == doubted
-
-
 def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
     assert robot.rig.imposed == "motor_current"
     assert {"electrical", "inductance", "supply"} <= absent_balances(robot)
@@ -159,16 +124,6 @@ def test_steady_speeds_follow_from_torque_whatever_the_winding(robot, resistance
         assert_allclose(found.reading["motor_speed"], settles(current), rtol=1e-6)
         assert_allclose(found.reading["motor_current"], current, rtol=1e-9)
     assert float(steady(robot, Conditions(motor_current=0.5)).reading["motor_speed"]) == 0.0  # friction holds it
-
-
-@pytest.mark.slow
-def test_a_run_follows_its_first_order_law(robot):
-    times = jnp.linspace(0.0, 1.0, 21)
-    driven = jax.jit(lambda current: drive(robot, Conditions(motor_current=current), times))
-    found = driven(2.0)
-    assert_allclose(found.signals.speed_motor, followed(2.0, np.asarray(times)), rtol=0, atol=0.15)
-    at_rest = driven(0.5)
-    assert np.abs(at_rest.signals.speed_motor).max() < 1e-6
 
 
 def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_path):
@@ -244,24 +199,3 @@ def test_levels_of_the_current_are_blocks_to_hold_out_and_curves_are_over_it(rob
     assert list(blocks) == ["current"] and len(blocks["current"]) == 8
     found = kind.of(runs, robot).bases(runs.columns, np.ones(len(runs), bool), robot)
     assert ("track", "current") in bases.family_names(found)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("robot")
-def test_commands_take_a_current_or_say_what_to_state(tmp_path, mmrjax):
-    ends(mmrjax("simulate --robot rig.toml --motor-current 2 --no-report --out one"), code=0)
-    (row,) = rows(tmp_path / "one/runs.csv")
-    assert_allclose(float(row["motor_speed_rpm"]), settles(2.0) * 30 / np.pi, rtol=1e-6)
-    assert row["motor_current_A"] == "2"
-    ends(mmrjax("sweep --robot rig.toml --motor-currents 1,2,-2 --no-report --out many"), code=0)
-    for words, said in (
-        (
-            "simulate --voltage 12",
-            "--voltage: the motors' current is imposed on this robot; give --motor-current [A]",
-        ),
-        ("simulate", "--motor-current: not given; give it [A], such as --motor-current 2"),
-        ("simulate --battery", "--battery: the motors' current is imposed on this robot"),
-        ("sensitivity", "sensitivity: this robot imposes the motor current"),
-        ("simulate --model track --motor-current 1", "a shaft has no running gear"),
-    ):
-        ends(mmrjax(f"{words} --robot rig.toml --out none"), said)

@@ -3,7 +3,6 @@
 import os
 import re
 
-import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
@@ -13,9 +12,6 @@ from calibration.data.runs import Path, read_runs
 from calibration.discovery.loop_input import remove_copies
 from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import Remark
-from mmrjax.errors import count_noun
-from mmrjax.model.channels import channels_named
-from sweeps.pages import comparison_figures
 from tests.commands import read_rig, read_table
 
 RIG = """
@@ -153,26 +149,6 @@ def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):
     rows = "".join(f"{speed},{0.01 * k},24\n" for k, speed in enumerate((4500, 4400, 4300, 4200)))
     found = table(tmp_path, f"motor_speed_rpm,motor_current_A,motor_voltage_V\n{rows}", robot)
     assert _check_stuck_channels(found) == [Remark("stiff_supply", column="motor_voltage_V", value=24.0)]
-
-
-@pytest.mark.parametrize("count", [1, np.int64(1), np.int32(2), np.uint8(0)])
-def test_counts_of_numpy_are_counts(count):
-    assert count_noun(count, "row") == f"{int(count)} row" + ("" if int(count) == 1 else "s")
-
-
-@pytest.mark.parametrize("column, label, shown", [
-    ("motor_current_A", "motor current [A]", ["output_speed"]),
-    ("motor_speed_rpm", "motor speed [rpm]", ["motor_current", "output_speed"]),
-    (None, "row", ["motor_current", "output_speed"]),
-])  # fmt: skip
-def test_errors_are_drawn_over_what_is_imposed_or_the_rows(column, label, shown):
-    rows = {"configuration": np.repeat("shaft", 3)} | ({} if column is None else {column: np.arange(3.0)})
-    shown = channels_named(shown)
-    for channel in shown:
-        rows |= {channel.column: np.ones(3), f"simulated_{channel.column}": np.full(3, 1.1)}
-        rows[f"error_{channel.name}_percent"] = np.full(3, 10.0)
-    fig = comparison_figures.draw_errors_over_conditions(rows, shown)
-    assert fig.axes[-1].get_xlabel() == label
 
 
 def test_echoes_of_input_are_short():

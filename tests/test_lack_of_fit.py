@@ -2,7 +2,6 @@
 tell."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ from synthetic import table
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
-from calibration.discovery.result_remarks import noise_remarks_before_verdict
-from calibration.discovery.verdict import VerdictNoise
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import AdequacyFinding
 from calibration.inference.lack_of_fit import (
@@ -165,18 +162,6 @@ def test_noise_of_one_channel_that_is_off_is_said_of_that_channel():
     jacobian[:, 2] *= 3
     (off,) = noise_remarks(replace(made, whitened=whitened, jacobian=jacobian.reshape(270, -1)))
     assert off.channel == "speed" and off.factor == pytest.approx(3.0, rel=0.1)
-
-
-def test_what_is_said_of_sds_beside_an_answer_is_of_what_it_leaves():
-    """Before: 130 times the sds, everywhere. The answer leaves noise, or twice as much as was stated."""
-    noise = SimpleNamespace(word="stated")
-    before = VerdictNoise(noise, {}, tuple(noise_remarks(toy(default_rng(7), noise=130.0))))
-    assert before.remarks[0].factor > 100 and noise_remarks_before_verdict(before, toy(default_rng(9))) == ()
-    (off,) = noise_remarks_before_verdict(before, toy(default_rng(9), noise=2.0))
-    assert off.factor == pytest.approx(2.0, rel=0.2)
-    changed = replace(before, factors={"speed": 130.0})
-    assert noise_remarks_before_verdict(changed, toy(default_rng(9))) == before.remarks
-    assert noise_remarks_before_verdict(changed, toy(default_rng(9), noise=1 / 130)) == ()
 
 
 def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():

@@ -17,8 +17,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.profiles import read_profile
 from calibration.data.rig_facts import doubtful_torque, log_doubts
 from calibration.inference import bases
-from calibration.inference.blocks import distinct_held_out_blocks, kind_in_words
-from calibration.inference.observers import Histories, SettledRuns
+from calibration.inference.observers import Histories
 from mmrjax.effects.curve import WAYS
 from mmrjax.errors import UsageError
 from mmrjax.fidelities import rest
@@ -192,16 +191,6 @@ def test_the_torque_of_a_row_is_read_in_its_unit(tmp_path, column, head, factor)
     assert "load_torque_Nm" in runs.axes
 
 
-def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path, robot):
-    head = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,load_torque_mNm"
-    with pytest.raises(BadData) as error:
-        read_table(tmp_path, f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n", robot, "runs.csv")
-    assert str(error.value) == (
-        "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle; a brake acts only "
-        "on a shaft; give slope_deg or payload_kg, or describe the load as a shaft"
-    )
-
-
 def test_a_torque_without_a_sign_is_said_to_drive_a_shaft_that_runs_backward(tmp_path):
     head = "supply_voltage_V,motor_speed_rpm,motor_current_A,load_torque_Nm\n24,4000,4.2,0.2\n"
     for row, drives in (("-24,-4400,3.8,0.2", True), ("-24,-4000,-4.2,-0.2", False)):
@@ -226,15 +215,6 @@ def test_a_log_holds_the_torque_of_every_sample(tmp_path, between):
     moving = np.diff(times) > 0
     assert_allclose(held[:-1][moving], at[moving])
     assert observe.driven.load_torque.min() >= torque.min()
-
-
-def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
-    torque = [0.1, 0.1003, 0.2, 0.2004, 0.4, 0.4001]
-    lines = ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", *(f"24,{4000 - 900 * m:.6g},{m}" for m in torque)]
-    runs, _ = read(tmp_path, lines)
-    found = distinct_held_out_blocks(runs, SettledRuns.blocks)
-    assert list(found) == ["load_torque"] and [int(m.sum()) for m in found["load_torque"].values()] == [2, 2, 2]
-    assert kind_in_words("load_torque") == "load torque"
 
 
 @pytest.mark.parametrize("torque", [{}, {"load_torque_Nm": np.linspace(0, 0.5, 18)}])
@@ -275,27 +255,3 @@ def test_a_profile_and_a_sweep_state_the_torque(tmp_path, robot):
         mm.sweep(robot, load_torques=[0.5])
     stated = campaign_of_grid(Sweep(load_torques_Nm=(0.0, 0.5), voltages_V=(12.0,), robot="rig.toml")).axes
     assert stated["load_torque"] == [0.0, 0.5]
-
-
-@pytest.mark.nightly
-def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
-    """Of one voltage, from a file that is off by a tenth: R 0.5, k 0.05, M0 0.01."""
-    torque = np.round(np.arange(9) * 0.1, 1)
-    current = (torque + 0.01) / 0.05
-    speed = (24 - 0.5 * current) / 0.05 * 30 / np.pi
-    current += 0.003 * default_rng(1).standard_normal(9)  # an exact line would be a computed current
-    head = 'channels = ["motor_current", "motor_speed"]\n[columns]\nload_torque_Nm = "output_torque_Nm"'
-    off = RIG.format(head=head)
-    for true, stated in ((0.5, "0.54 ± 10 %"), (0.05, "0.047 ± 10 %"), (0.01, "0.02 ± 100 %"), ("1.0", "1 ± 0")):
-        off = off.replace(f" = {true}\n", f' = "{stated}"\n')
-    rig = read_rig(tmp_path, off)
-    columns = {
-        "supply_voltage_V": np.full(9, 24.0),
-        "motor_speed_rpm": np.round(speed, 1),
-        "output_torque_Nm": torque,
-    }
-    runs = mm.read_runs(columns | {"motor_current_A": np.round(current, 3)}, robot=rig)
-    found = mm.discover(runs, rig, noise="motor_current=0.003 A,motor_speed=0.03 rpm")
-    assert found.verdict == "none"
-    for name, value in {"resistance": 0.5, "torque_constant": 0.05, "friction_coulomb": 0.01}.items():
-        assert_allclose(getattr(found.robot.motor, name), value, rtol=0.01)

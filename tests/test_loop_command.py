@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 import tempfile
-import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -197,18 +196,6 @@ def test_copies_count_once_and_are_said(done):
     assert any("row 25 is an exact copy" in note for note in done.result["notes"])
 
 
-def test_report_tells_the_story_in_order(done):
-    text = (done.folder / "found/report.html").read_text(encoding="utf-8")
-    assert done.result["statement"].split(" (")[0] in text
-    order = [
-        'id="contents"', 'id="before_after"', 'id="defects"', 'id="adequacy"', 'id="would_be_seen"', 'id="unseen"',
-        '<table id="base"', '<table id="words"', 'id="files"',
-    ]  # fmt: skip
-    at = [text.find(mark) for mark in order]
-    assert -1 not in at and at == sorted(at)
-    assert not re.search(r"\bnan\b|Undefined|\{\{", re.sub(r"<svg.*?</svg>", "", text, flags=re.S))
-
-
 # --- effects of the user's own, and thin data --------------------------------------------------------
 
 
@@ -226,15 +213,6 @@ def test_users_effect_is_scored_and_named(quick, tmp_path):
     assert result["verdict"] == "named" and [e["name"] for e in result["effects"]] == ["payload_binding"]
     assert result["scores"][0]["name"] == "payload_binding" and result["scores"][0]["score"] > 60
     assert "[effects.payload_binding]" in (tmp_path / "x/robot.toml").read_text()
-
-
-@pytest.mark.slow
-def test_one_voltage_gives_a_verdict(quick, tmp_path):
-    table = tables.narrow(seed=1).table
-    result = result_with_own_effect(tmp_path, {k: v[table["supply_voltage_V"] == 24] for k, v in table.items()})
-    assert result["verdict"] == "none" and result["effects"] == []
-    assert result["adequate"]["before"] and result["next_experiment"] is None
-    assert any("supply_voltage_V" in note for note in result["notes"])  # what one voltage cannot show
 
 
 # --- bad input ---------------------------------------------------------------------------------------
@@ -293,20 +271,6 @@ def test_histories_go_through_the_command(started):
     assert r["evidence"]["before"]["white"]["threshold"] > 0
     # the errors by blocks that differ: slope, voltage and payload go together in these six runs
     assert set(r["held_out_by"]) == {"slope", "run"}
-
-
-@pytest.mark.nightly
-def test_robot_found_in_histories_starts_with_the_effect_and_its_page_has_what_only_they_tell(started):
-    folder = started.folder / "found"
-    assert tomllib.loads((folder / "robot.toml").read_text())["effects"]["churning"]["amplitude"] > 0
-    run = "simulate --robot found/robot.toml --model drive --out run --duration 0.5 --no-report"
-    assert mmrjax(started.folder, *run.split()).code == 0
-    page = (folder / "report.html").read_text()
-    for words in ("What only time histories show", "Ljung and Box", "246 of 246 samples", "t [s]"):
-        assert words in page
-    assert "What each equation lacks" not in page
-    figures = {p.stem for p in (folder / "figures").iterdir()}
-    assert "series" in figures and "defects" not in figures
 
 
 # --- a channel more ----------------------------------------------------------------------------------

@@ -2,10 +2,8 @@
 
 import difflib
 import json
-import re
 from dataclasses import replace
 from types import SimpleNamespace
-from unittest.mock import ANY
 
 import jsonschema
 import numpy as np
@@ -29,17 +27,13 @@ from calibration.discovery.result import (
     WorseChannel,
 )
 from calibration.discovery.settings import WITHOUT_NAME
-from calibration.discovery.verdict import FAR
-from calibration.inference.fit_notes import Remark, remarks_with_codes
 from calibration.inference.identifiability import HELD
-from calibration.words.loop_words import largest_share, p_value
-from mmrjax.model import channels
+from calibration.words.loop_words import p_value
 from sweeps.commands.loop import changes_by_effect
 from sweeps.pages.figure_style import figure_settings
-from sweeps.pages.loop_figures import BLUE, draw_effect_law
+from sweeps.pages.loop_figures import draw_effect_law
 from sweeps.report import page_renderer
-from sweeps.report.fit_tables import Change
-from sweeps.report.loop_report import _next_step, loop_document, rows_for_figures
+from sweeps.report.loop_report import loop_document, rows_for_figures
 from sweeps.report.terminal_renderer import print_document
 from tests.commands import schema_of
 
@@ -182,63 +176,6 @@ def band_of(axes):
     return axes.collections[-1].get_paths()[0].get_extents()
 
 
-def drawn_law(table, x_column, law, sd=0.1):
-    """Axes and legend of the law of an effect of size 1 on the motor's speed, of which readings miss nothing."""
-    speed = channels.find_channel("motor_speed")
-    law = np.asarray(law) * speed.factor
-    zero = np.zeros((len(law), 1))
-    found = SimpleNamespace(
-        channels=(speed,), included=np.full(len(law), True),
-        readings_of_rows=SimpleNamespace(measured=law[:, None], before=zero, sd=zero + speed.factor),
-        effects=[SimpleNamespace(name="ours", parameters={"amplitude": SimpleNamespace(value=1.0, sd=sd)})],
-    )  # fmt: skip
-    with figure_settings():
-        fig = draw_effect_law(found, table, "ours", Change(speed, 1.0, 0 * law, law))
-    fig.canvas.draw()
-    legend = next(x for x in [*fig.legends, *(a.get_legend() for a in fig.axes)] if x)
-    assert fig.axes[0].get_xlabel() == x_column
-    return fig.axes[0], [text.get_text() for text in legend.get_texts()]
-
-
-def curves_of(axes, colour):
-    return [line for line in axes.lines if line.get_color() == colour and len(line.get_xdata()) > 2]
-
-
-def test_both_directions_of_a_law_have_their_own_line():
-    """Hollow dots are of backward runs, and no line crosses from one direction to the other."""
-    volts = np.r_[-24:0:3, 3:25:3].astype(float)
-    axes, names = drawn_law(
-        {"supply_voltage_V": volts, "configuration": np.full(16, "a")}, "supply voltage [V]", np.abs(volts)
-    )
-    assert names.count("backward") == 1 and len([n for n in names if n.startswith("new law")]) == 1
-    ways = [np.sign(line.get_xdata()) for line in curves_of(axes, BLUE)]
-    assert len(ways) == 2 and all(np.ptp(way) == 0 for way in ways)
-
-
-def levels(torque):
-    """A table of three voltages and these torques."""
-    return {"supply_voltage_V": VOLTS, "load_torque_Nm": torque, "configuration": np.full(21, "a")}
-
-
-VOLTS = np.repeat([4.0, 8.0, 12.0], 7)
-
-
-def test_a_law_over_two_quantities_is_a_line_for_each_level():
-    """One line over the current went up and down between the levels of the voltage."""
-    torque = np.tile(np.linspace(0.0, 3.0, 7), 3)
-    axes, names = drawn_law(levels(torque), "load torque [N·m]", -torque * (1 + 4 / VOLTS))
-    lines = curves_of(axes, BLUE)
-    assert len(lines) == 3 and all(np.all(np.diff(line.get_ydata()) < 0) for line in lines)
-    assert "new law by supply voltage, 95 % band (±20 %)" in names
-    assert band_of(axes).y0 == pytest.approx(1.196 * min(lines[-1].get_ydata()), rel=1e-3)
-
-
-def test_a_law_that_depends_on_more_has_a_mark_for_each_run():
-    torque = default_rng(1).permutation(21) / 7
-    axes, _ = drawn_law(levels(torque), ANY, default_rng(2).standard_normal(21))
-    assert not any(len(x.get_xdata()) > 2 and x.get_linestyle() == "-" for x in axes.lines)
-
-
 def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
     got = shown("churning", capsys)
     d, seen, rows = got.found.to_json()["chi2"], got.found.readings_of_rows, got.found.included
@@ -250,22 +187,8 @@ def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
     assert f"readings {of_readings['before']:.0f} → {of_readings['after']:.0f} σ²" in got.page.text
 
 
-def test_reading_that_weighs_most_is_named(shown, capsys):
-    found = shown("churning", capsys).found
-    seen, row = found.readings_of_rows, int(np.flatnonzero(found.included)[3])
-    even = seen.measured + 0.5 * seen.sd
-    off = even.copy()
-    off[row, 1] += 40 * seen.sd[row, 1]
-    even, said = (
-        largest_share(replace(found, written=True, readings_of_rows=replace(seen, after=after)))
-        for after in (even, off)
-    )
-    assert said.startswith(f"Row {found.numbers[row]} ({found.runs['configuration'][row]}, ")
-    assert "its motor speed" in said and even == ""
-
-
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_held_by_its_prior_is_in_the_result_and_in_a_note(shown, capsys, name):
+def test_what_is_held_by_its_prior_is_in_the_result(shown, capsys, name):
     seen = shown(name, capsys)
     made, sd = seen.found, np.sqrt(np.diag(seen.found.posterior.covariance))  # of coordinates whose prior sd is 1
     held = made.held_by_prior
@@ -273,13 +196,6 @@ def test_what_is_held_by_its_prior_is_in_the_result_and_in_a_note(shown, capsys,
     assert set(held) == {n for n in of_posterior if not n.startswith("effects.unnamed")} != set()
     shifts = seen.document["base_shift"]
     assert {n for n, p in shifts.items() if p["held_by_prior"]} == {*held} & {*made.base_shift}
-    far = {n for n, p in made.base_shift.items() if abs(p.shift_after) > FAR}
-    pairs = {n for pair in made.together for n in (pair.one, pair.other)}
-    (note,) = remarks_with_codes(made.remarks, "held_by_prior")
-    assert list(note.names) == [n for n in held if n not in far | pairs]
-    assert far == {remark.name for remark in remarks_with_codes(made.remarks, "far_from_prior")}
-    together = [p for r in remarks_with_codes(made.remarks, "only_together") for p in r.pairs]
-    assert pairs == {n for p in together for n in (p.one, p.other)}
 
 
 def with_effect(found, **changes):
@@ -341,18 +257,3 @@ def test_a_result_is_told_as_recorded(shown, capsys, name):
     (words_now, numbers_now), (words_then, numbers_then) = tokens(text), tokens(recorded(f"loop_{name}", text))
     assert words_now == words_then
     assert numbers_now == pytest.approx(numbers_then, rel=1e-2, abs=1e-2)
-
-
-def test_the_head_of_a_page_is_read_in_a_minute(shown, capsys):
-    text = shown("churning", capsys).text
-    head = text[text.index("<h1>") : text.index('<nav id="contents"')]
-    assert len(re.sub(r"<table.*?</table>|<svg.*?</svg>|<[^>]+>", " ", head, flags=re.S).split()) <= 120
-
-
-@pytest.mark.parametrize("level", ["place", "class"])
-def test_a_run_that_is_different_is_checked_before_another_experiment(level):
-    test = NameTest("cogging", 7.1, 3.7, (), 0.0, 4, changed="bench.inertia", root_changed=15.8)
-    found = SimpleNamespace(
-        headline=SimpleNamespace(level=level), remarks=(Remark("run_differs", test=test),), next_experiment=None
-    )
-    assert ("run 4" in _next_step(found, "")) == (level == "place")

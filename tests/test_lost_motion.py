@@ -1,14 +1,12 @@
 """Backlash, play and soft couplings are noticed in a log by the angle that each reversal loses."""
 
-import dataclasses
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from calibration.described import describe
-from calibration.discovery import discover, log_stages, verdict
+from calibration.discovery import discover, verdict
 from calibration.discovery.loop_input import LoopInput, prepare_loop
 from calibration.discovery.stages import findings, search_until_clean
 from calibration.inference.lost_motion import lost_motion_notes
@@ -183,26 +181,3 @@ def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
         runs, robot = read(tmp_path, servo(play=play))
         given = prepare_loop(runs, robot, noise="output_angle=0.1deg")
         assert given.shows_unmodelled_backlash == (play > 0)
-
-
-@dataclasses.dataclass
-class Windows:
-    keep: Any = None
-    confirm: Any = None
-
-    def trace(self):
-        names = [self.keep(name, None) for name in ("ranking", "base", "search 0")]
-        return SimpleNamespace(names=names, screened=SimpleNamespace(base=SimpleNamespace(candidate="fit")))
-
-
-def test_stages_of_windows_are_stored_apart_and_their_fit_begins_the_simulation(monkeypatch):
-    """Windows without a finding left their base fit to the simulated path, which ended with an internal error."""
-    confirmed = []
-    monkeypatch.setattr(log_stages, "windows_of_log", lambda *_: Windows())
-    monkeypatch.setattr(log_stages, "confirm_windows", lambda given, windows, traced: confirmed.extend(traced.names))
-    monkeypatch.setattr(log_stages, "delayed_by_rows", lambda given, fit: fit)
-    monkeypatch.setattr(discover, "trace_verdict", Windows.trace)
-    robot = SimpleNamespace(has_ground=False)
-    given = LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
-    given.__dict__["space"] = SimpleNamespace(with_room=lambda names: None)
-    assert discover.trace_windows(given) == "fit" and confirmed == ["ranking", "windows base", "windows search 0"]

@@ -85,15 +85,6 @@ def test_a_robot_shows_values_and_units(robot):
     assert "Tracer" in traced[0] or "JitTracer" in traced[0]
 
 
-def test_a_wrong_name_of_a_parameter_is_answered_by_what_is_near(robot):
-    with pytest.raises(KeyError, match=r"no such parameter: motor\.resistanse \(did you mean motor\.resistance"):
-        mm.replace(robot, {"motor.resistanse": 0.5})
-    with pytest.raises(
-        KeyError, match=r"friction_coulomb \(did you mean motor\.friction_coulomb, gearbox\.friction_c"
-    ):
-        mm.replace(robot, {"friction_coulomb": 0.5})
-
-
 def test_package_states_its_names_version_and_types(robot):
     assert set(mm.__all__) <= set(dir(mm))
     assert {"motor", "gearbox", "battery"} <= set(dir(robot)) and "within" not in dir(robot)
@@ -150,14 +141,6 @@ def test_every_result_field_and_channel_is_an_attribute(robot):
         _ = one.torque
 
 
-def test_every_name_of_a_result_is_listed(robot):
-    fields = {field.name for field in dataclasses.fields(Result)}
-    one = mm.simulate(robot, mm.Conditions())
-    assert {*fields, *channels.USUAL, "statuses", "table", "model"} <= set(dir(one))
-    numbers = one.rows_table()
-    assert numbers.keys() == one.to_dict().keys()
-
-
 def test_status_compares_with_its_words_and_refuses_others(robot):
     many = mm.simulate(robot, mm.Conditions(voltage=[24.0, 0.5, 24.0], slope_deg=[5.0, 5.0, 20.0]))
     for codes in (many.status, many.result.status, jax.tree.map(lambda x: x, many).status):
@@ -192,15 +175,6 @@ def test_to_dict_has_the_columns_of_runs_csv(robot):
     assert weighed.to_dict()["total_mass_kg"].tolist() == [16.0, 17.0] == weighed.mass.tolist()
     on_battery = mm.simulate(robot, dataclasses.replace(runs, battery=jnp.asarray([0.0, 1.0])))
     assert_array_equal(on_battery.to_dict()["supply_voltage_V"], [24.0, np.nan])
-
-
-def test_outputs_name_every_number_of_a_result_once():
-    named = [output.name for output in outputs.output_table(channels.usual_channels())]
-    fields = [field.name for field in dataclasses.fields(Result)]
-    assert sorted(named) == sorted({*channels.USUAL, *fields} - {"reading", "mass", "status", "flags"})
-    for output in outputs.output_table(channels.usual_channels()):
-        assert output.column == output.name or output.column.startswith(f"{output.name}_")
-        assert output.label and output.unit
 
 
 def test_table_shows_units_and_as_many_rows_as_wanted(robot):
@@ -371,11 +345,6 @@ def test_wrong_calls_are_said(message, robot):
     with pytest.raises(mm.UsageError) as error:
         mm.simulate(**{"robot": robot, "conditions": mm.Conditions()} | WRONG_CALL[message])
     assert isinstance(error.value, ValueError) and str(error.value) == message
-
-
-def test_shapes_that_do_not_broadcast_are_refused():
-    with pytest.raises(ValueError, match="shapes do not broadcast"):
-        mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])
 
 
 MASKED = np.ma.masked_array([24.0, 12.0], [False, True])
