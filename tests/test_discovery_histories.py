@@ -11,17 +11,15 @@ import pytest
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy import stats
-from synthetic import STATED, Analyst, known, parts, table
+from synthetic import STATED, Analyst, parts, table
 from worlds import histories
 
-from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
-from calibration.discovery.score_tests import bootstrap_statistics
 from calibration.discovery.settings import settings_for
 from calibration.discovery.standing import judge_names
 from calibration.inference import noise
-from calibration.inference.bases import BALANCES, Basis
+from calibration.inference.bases import BALANCES
 from calibration.inference.linearization import PROBED, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
@@ -167,16 +165,6 @@ def is_of_noise(null, readings):
 
 
 @pytest.mark.slow
-def test_bootstrap_leaves_what_noise_leaves(seen):
-    share = np.asarray(seen.linear.time) / 0.8
-    over_time = Basis.of(np.stack([share, share**2], -1)[None], (("track", "time"),))
-    effects = seen.space.library.scored
-    null = bootstrap_statistics(seen.problem, np.asarray(seen.z), seen.linear, effects, (over_time,), 100, 0)
-    assert len(null.chi2) > 90
-    is_of_noise(null, 3 * len(seen.runs))
-
-
-@pytest.mark.slow
 def test_linear_bootstrap_is_that_of_refits(clean, seen):
     """Statistics of replicates by the linear refit, against a few histories drawn and fitted again in full."""
     is_of_noise(clean.left.test.null, 3 * len(clean.runs))
@@ -226,15 +214,6 @@ def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs, robot)
 
 
 # --- input checks ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_histories_that_do_not_start_from_rest_are_refused(runs, robot):
-    late = runs.where(runs["time_s"] > 0.3)
-    late.columns["time_s"] = late["time_s"] - 0.32
-    with pytest.raises(BadData, match=r"run start0 is moving at 0 s .* begins at rest"):
-        Histories.check_start(late, known(late), robot)
-    Histories.check_start(runs, known(runs), robot)
 
 
 @pytest.mark.slow
