@@ -27,7 +27,7 @@ from pyarrow import feather, parquet
 from test_more_formats import sysid_log, wpilog, write_xlsx
 from test_sources import COLUMNS, RIG
 
-from calibration.data import robot_file
+from calibration.data import input_files, robot_file
 from calibration.data.contents import inspect_source
 from calibration.data.input_errors import InputError
 from calibration.data.runs import read_runs
@@ -572,3 +572,22 @@ URDF = """<robot name="r"><link name="base"><inertial><mass value="5"/></inertia
 <mass value="0.3"/><inertia ixx="1e-4" iyy="1e-4" izz="2e-4" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>
 <cylinder radius="0.05" length="0.02"/></geometry></collision></link><joint name="j" type="continuous">
 <parent link="base"/><child link="wheel"/><axis xyz="0 0 1"/><dynamics damping="0.1" friction="0.02"/></joint></robot>"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("fault", ["gone", "cut", "replaced"])
+def test_a_file_that_changes_after_it_was_listed_is_refused_or_read(tmp_path, robot, name, fault, monkeypatch):
+    path, damaged = write(tmp_path, name)
+    content = damaged.read_bytes()
+
+    def spoil(*_):
+        if fault == "gone":
+            damaged.unlink(missing_ok=True)
+        else:
+            damaged.write_bytes(content[: len(content) // 2] if fault == "cut" else b"\0" * 64)
+
+    honest = input_files.check_memory
+    monkeypatch.setattr(input_files, "check_memory", lambda *a: (spoil(), honest(*a)))
+    wrong, _ = asked(*doors(path, robot))
+    assert not wrong, wrong

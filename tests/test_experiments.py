@@ -1,5 +1,6 @@
 """The next experiment: what the menu foresees, which experiment is chosen, and what its readings say."""
 
+import types
 from dataclasses import replace
 
 import equinox as eqx
@@ -14,9 +15,11 @@ from test_worlds_tables import SHAPES
 from worlds import laws, settled, tables
 
 from calibration.data.robot_file import change_robot
-from calibration.discovery import experiments, menu
+from calibration.described import describe
+from calibration.discovery import assembly, experiments, menu
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates
 from calibration.discovery.classes import Classes, Shift
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.predicted import (
     batch_experiments,
     map_over_runs,
@@ -31,6 +34,7 @@ from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Rig
 from sweeps.stage_files import read_stage, write_stage
 from tests.commands import read_rig
 
@@ -414,3 +418,66 @@ def test_every_experiment_is_kept_in_a_stage(tmp_path):
     write_stage(tmp_path / "menu", MENU)
     assert read_stage(tmp_path / "menu") == MENU
     assert {type(e) for e in MENU} == {menu.CalibrationAct, menu.ProposedRuns}
+
+
+def test_reverse_travel_turns_the_sign_of_a_biased_slope_alone(shown):
+    at = SPANS
+    plain, biased = (shown(settled.CLIMBING, laws.Term("slope_bias", a))[0] for a in (0.0, 0.02))
+    change = biased - plain
+    assert change[at["reverse, 6T2A"]][0] < 0 < change[at["downhill, 6T2A"]][0]  # of the current
+
+
+@pytest.mark.slow
+def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
+    space = seen["mass_error", "tension_friction"][1]
+    where = DiscrepancyLocation("track", "speed", ("track",), (), 60.0, 60.0)
+
+    def proposed(**changes):
+        return experiments.propose_denser_runs(space, replace(where, **changes), SETTINGS)
+
+    strong, weak, wave = proposed(), proposed(strongest=4.0), proposed(variable="order 2 of the driving shaft")
+    assert "speed" in strong.name and strong.instruction.place == "track" and int(space.included.sum()) == 90
+    assert strong.expected_sigma == pytest.approx(np.sqrt(60 * 45 / 90))
+    assert (weak.instruction.variable, weak.name, weak.expected_sigma) == ("speed", experiments.NONE, 0)
+    assert wave.name == "steady speeds for order 2 of the driving shaft"
+
+
+@pytest.mark.slow
+def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
+    made = menu.experiment_menu(reach(rover, LEVEL))
+    runs = runs_of(made)
+    assert all(set(r.slope) <= {0.0, -0.0} and set(r.payload) == {0.0} and max(r.voltage) <= 12.0 for r in runs)
+    assert not {"downhill", "steepest slope", "payload"} & {k for r in runs for k in r.kinds}
+    assert made[0].name == "weigh" and {m for _, m in made[0].at} == {0.0}
+
+
+@pytest.mark.slow
+def test_higher_voltage_needs_a_rating_and_is_watched(rover):
+    within = reach(change_robot(rover, {"motor.voltage_limit": 18.0}, where="test"))
+    run = named(menu.experiment_menu(within), "other voltages, rover")
+    assert max(run.voltage) == 18.0
+    shown = menu.restrict_run(run, *plain(run))
+    assert Remark("overvoltage", voltage=18.0, used=12.0) in shown.watch
+
+
+@pytest.mark.slow
+def test_steepest_slope_is_one_that_the_robot_climbs():
+    slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
+    does = np.asarray(eqx.filter_jit(foreseen)(slippery, batch_experiments(MENU, channels.USUAL)).does)
+    kept, first = {}, 0
+    for run in runs_of(MENU):
+        rows = slice(first, first := first + len(run.voltage))
+        kept[run.name] = menu.possible_runs(run, does[rows])
+    # tan 21.5 deg = 0.394 and rolling resistance: beyond the adhesion
+    assert not kept["steepest slope, 6T2A"].any() and kept["lifted, 6T2A"].all()
+
+
+def test_a_class_of_a_servos_log_has_no_experiment_of_the_menu():
+    """The menu has no runs with a goal: the loop ended in an IndexError once effects of a servo were inseparable."""
+    seen = types.SimpleNamespace(menu=True, word="sample")
+    base = types.SimpleNamespace(rig=Rig(imposed="goal_angle"))
+    space = types.SimpleNamespace(bare=types.SimpleNamespace(observe=seen, base=base))
+    traced = types.SimpleNamespace(verdict="class", where=None, alike=object())
+    proposal = assembly._next_experiment(space, traced, None)
+    assert proposal.experiments == (experiments.NONE,)
+    assert describe(proposal.instruction).endswith("no experiments for goals of a controller")

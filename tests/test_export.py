@@ -6,6 +6,7 @@ import ast
 import csv
 import importlib
 import io
+import os
 import re
 import shutil
 import subprocess
@@ -43,16 +44,17 @@ from sweeps.export.expressions import (
     lines_of,
     trace_function,
 )
-from sweeps.export.feed_forward import map_of_drive, table_files, table_law_function
+from sweeps.export.feed_forward import fates_in_tables, map_of_drive, table_files, table_law_function
 from sweeps.export.formats import draw_parameters, export_format, middle_run, randomization_files
 from sweeps.export.jax_actuator import (
     actuator_law_function,
     difference_from_jax,
+    fates_in_actuator,
     jax_files,
     onnx_files,
     settled_actuator,
 )
-from sweeps.export.joint import INSIDE, joint_of_robot
+from sweeps.export.joint import INSIDE, channels_of, joint_of_robot
 from sweeps.export.law_source import (
     LawConstant,
     function_arguments,
@@ -60,8 +62,9 @@ from sweeps.export.law_source import (
     law_constants,
     mjlab_files,
     module_from_source,
+    torch_source,
 )
-from tests.commands import ends, read_json
+from tests.commands import ROOT, ends, read_json
 
 WHEELS, TRACKS = "4W2T", "6T2A"
 #: Comments of a model's constants.
@@ -686,3 +689,67 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
 
     angles = jax.lax.scan(advance, (module.initial_state(), 0.0, 0.0), None, length=10_001)[1]
     assert np.abs(angles[::400] - native).max() < in_jax
+
+
+@pytest.mark.slow
+def test_serialised_actuator_has_the_same_bytes_in_every_process_and_folder(rig, tmp_path):
+    code = (
+        "import sys; from calibration.data import robot_file; "
+        "from sweeps.export import jax_actuator, joint, law_source; "
+        "drive = joint.joint_of_robot(robot_file.find_robot_file('rig.toml')); "
+        "module = law_source.module_from_source(law_source.jax_source(drive, law_source.law_constants(drive, None, None))); "
+        "sys.stdout.buffer.write(jax_actuator.serialise_actuator(module))"
+    )
+    found = []
+    for seed in "12":
+        (folder := tmp_path / seed).mkdir()
+        shutil.copy(rig, folder)
+        shutil.copytree(ROOT / "sweeps", folder / "sweeps")
+        path = os.pathsep.join(filter(None, [str(folder), str(ROOT), os.environ.get("PYTHONPATH")]))
+        given = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": path}
+        words = [sys.executable, "-c", code]
+        found.append(subprocess.run(words, cwd=folder, env=given, check=True, capture_output=True).stdout)
+    assert found[0] == found[1] and len(found[0]) > 1000
+
+
+def test_a_rig_whose_angle_alone_is_read_is_compared_by_its_motor(rig):
+    rig.write_text(RIG.replace('["total_current", "motor_speed"]', '["output_angle"]'))
+    drive = drive_of(rig)
+    assert {c.name for c in channels_of(drive)} == {"motor_speed", "motor_current"}
+
+
+def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
+    rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
+    drive = drive_of(rig)
+    in_mujoco, in_jax, in_tables = (
+        {f.name: f for f in fates}
+        for fates in (mujoco.fates_in_mujoco(drive, 0.0), fates_in_actuator(drive), fates_in_tables(drive, law_constants(drive, None, None)))
+    )  # fmt: skip
+    held, near, lost = comparison.HELD, comparison.APPROXIMATED, comparison.DROPPED
+    for name, verdicts in ((mujoco.PLAY, [held, held, lost]), (mujoco.CONTROLLER, [near, held, lost])):
+        assert [v[name].verdict for v in (in_mujoco, in_jax, in_tables)] == verdicts
+    assert "lag of 0.005 s is dropped" in in_mujoco[mujoco.CONTROLLER].how
+    assert "0.03 rad of play" in in_tables[mujoco.PLAY].how
+    rig.write_text(APART["servo at 50 Hz"][0])
+    (how,) = (f.how for f in mujoco.fates_in_mujoco(drive_of(rig), 0.0) if f.name == mujoco.CONTROLLER)
+    assert "acts at each step, not at 50 Hz" in how
+    rig.write_text(rig.read_text().replace("supply_voltage = 7.4", ""))
+    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; add it"):
+        drive_of(rig)
+
+
+def test_mjlab_actuator_of_a_servo_with_play_is_that_of_jax(monkeypatch, rig):
+    stand_in(monkeypatch)
+    rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
+    drive = drive_of(rig)
+    modules = [law_of(drive, source=source) for source in (jax_source, torch_source)]
+    states = [module.initial_state((3,)) for module in modules]
+    goal, angle, speed = np.array([[1.0, -0.5, 0.3], [0.0, 0.1, -0.2], [0.0, 0.0, 0.0]])
+    for _ in range(40):
+        (ours, states[0], _), (theirs, states[1], _) = (
+            m.actuator(m.PARAMS, s, goal, angle, speed, 2e-3) for m, s in zip(modules, states, strict=True)
+        )
+        assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
+        speed = speed + 2e-3 * np.asarray(ours) / float(drive.load.inertia)
+        angle = angle + 2e-3 * speed
+    assert np.abs(ours).max() > 0.01

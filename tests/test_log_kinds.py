@@ -8,6 +8,8 @@ from calibration.data.robot_file import change_robot
 from calibration.data.runs import read_runs
 from calibration.data.settling import settle_log
 from calibration.data.stated import EXAMPLE
+from calibration.data.unused_readings import thin_rows
+from calibration.inference import bases, observers
 from calibration.inference.preparation import prepare_input
 from sweeps.commands import rig_new
 from sweeps.points import run as points
@@ -110,3 +112,46 @@ def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_p
     shown = points.simulate_histories(ready.robot, runs, None)
     error = np.std(shown[column] - runs[column])
     assert error < 0.01 * np.ptp(runs[column]) and error > 0.1 * least
+
+
+@pytest.mark.slow
+def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_path, monkeypatch):
+    """Of a servo on PWM the duty's share of the supply. While the circuit is open, the back-EMF of the run itself."""
+    log = {name: column[::2] for name, column in servo(default_rng(4), levels=(0.9,), hold=0.5).items()}
+    driven = np.arange(len(log["time_s"])) < 15
+    log["duty"] = np.where(driven, log["duty"], 0.0)
+    robot = written(tmp_path, "servo", log)
+    runs = read_runs({**log, "mode": np.where(driven, "voltage", "coast")}, robot=robot)
+    observer = observers.Histories.of(runs, robot)
+    seen = {}
+    monkeypatch.setattr(bases, "curve_families", lambda columns, *_, **__: seen.update(columns) or ())
+    observer.bases(dict(runs.columns), np.ones(len(runs), bool), robot)
+    volts = seen[VOLTS]
+    assert volts[driven] == pytest.approx(0.9 * 6.0)
+    rolls_out = volts[~driven]
+    assert 0 < rolls_out[0] < 0.9 * 6.0 and (np.diff(rolls_out) < 1e-3).all() and rolls_out[-1] < 0.5 * rolls_out[0]
+
+
+def test_a_thinned_log_takes_the_mean_of_its_current_and_fewer_steps(tmp_path):
+    """The current changes in each of 4000 rows. It moves the load by as much, and as far, at each reading that is kept."""
+    rng, time = default_rng(4), np.arange(4000) * 1e-3
+    current = 1.6 * np.sin(5 * time) + 0.4 * np.sin(40 * time) + 0.05 * rng.standard_normal(len(time))
+    current[2500:] += 1.0  # a jump, whose row stays
+
+    def travelled(times, amperes):
+        """Charge [A·s] and its integral [A·s²] at each instant, of a current that is held from one to the next."""
+        lasts = np.diff(times)
+        charge = np.append(0.0, np.cumsum(amperes[:-1] * lasts))
+        return charge, np.append(0.0, np.cumsum(charge[:-1] * lasts + amperes[:-1] * lasts**2 / 2))
+
+    wanted = travelled(time, current)
+    columns = {"time_s": time, "motor_current_A": current, "position_mm": 1e3 * wanted[1]}
+    robot = written(tmp_path, "carriage", columns)
+    runs = read_runs(tmp_path / "log.csv", robot=robot).of(robot)
+    thinned = thin_rows(runs, 500)
+    brief = observers.Histories.of(thinned, robot)
+    times, amperes = np.asarray(brief.times[0]), np.asarray(brief.conditions.motor_current[0])
+    assert len(times) < 0.6 * len(time) and 2.5 in times
+    rows = np.searchsorted(time, thinned["time_s"] - 1e-9)
+    for simulated, true, error in zip(travelled(times, amperes), wanted, (2e-4, 2e-6), strict=True):
+        np.testing.assert_allclose(simulated[np.searchsorted(times, thinned["time_s"])], true[rows], atol=error)

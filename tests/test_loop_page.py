@@ -29,10 +29,12 @@ from calibration.discovery.result import (
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD
 from calibration.words.loop_words import p_value
+from mmrjax.model import channels
 from sweeps.commands.loop import changes_by_effect
 from sweeps.pages.figure_style import figure_settings
-from sweeps.pages.loop_figures import draw_effect_law
+from sweeps.pages.loop_figures import BLUE, draw_effect_law
 from sweeps.report import page_renderer
+from sweeps.report.fit_tables import Change
 from sweeps.report.loop_report import loop_document, rows_for_figures
 from sweeps.report.terminal_renderer import print_document
 from tests.commands import schema_of
@@ -257,3 +259,54 @@ def test_a_result_is_told_as_recorded(shown, capsys, name):
     (words_now, numbers_now), (words_then, numbers_then) = tokens(text), tokens(recorded(f"loop_{name}", text))
     assert words_now == words_then
     assert numbers_now == pytest.approx(numbers_then, rel=1e-2, abs=1e-2)
+
+
+def drawn_law(table, x_column, law, sd=0.1):
+    """Axes and legend of the law of an effect of size 1 on the motor's speed, of which readings miss nothing."""
+    speed = channels.find_channel("motor_speed")
+    law = np.asarray(law) * speed.factor
+    zero = np.zeros((len(law), 1))
+    found = SimpleNamespace(
+        channels=(speed,), included=np.full(len(law), True),
+        readings_of_rows=SimpleNamespace(measured=law[:, None], before=zero, sd=zero + speed.factor),
+        effects=[SimpleNamespace(name="ours", parameters={"amplitude": SimpleNamespace(value=1.0, sd=sd)})],
+    )  # fmt: skip
+    with figure_settings():
+        fig = draw_effect_law(found, table, "ours", Change(speed, 1.0, 0 * law, law))
+    fig.canvas.draw()
+    legend = next(x for x in [*fig.legends, *(a.get_legend() for a in fig.axes)] if x)
+    assert fig.axes[0].get_xlabel() == x_column
+    return fig.axes[0], [text.get_text() for text in legend.get_texts()]
+
+
+def curves_of(axes, colour):
+    return [line for line in axes.lines if line.get_color() == colour and len(line.get_xdata()) > 2]
+
+
+def test_both_directions_of_a_law_have_their_own_line():
+    """Hollow dots are of backward runs, and no line crosses from one direction to the other."""
+    volts = np.r_[-24:0:3, 3:25:3].astype(float)
+    axes, names = drawn_law(
+        {"supply_voltage_V": volts, "configuration": np.full(16, "a")}, "supply voltage [V]", np.abs(volts)
+    )
+    assert names.count("backward") == 1 and len([n for n in names if n.startswith("new law")]) == 1
+    ways = [np.sign(line.get_xdata()) for line in curves_of(axes, BLUE)]
+    assert len(ways) == 2 and all(np.ptp(way) == 0 for way in ways)
+
+
+def levels(torque):
+    """A table of three voltages and these torques."""
+    return {"supply_voltage_V": VOLTS, "load_torque_Nm": torque, "configuration": np.full(21, "a")}
+
+
+VOLTS = np.repeat([4.0, 8.0, 12.0], 7)
+
+
+def test_a_law_over_two_quantities_is_a_line_for_each_level():
+    """One line over the current went up and down between the levels of the voltage."""
+    torque = np.tile(np.linspace(0.0, 3.0, 7), 3)
+    axes, names = drawn_law(levels(torque), "load torque [N·m]", -torque * (1 + 4 / VOLTS))
+    lines = curves_of(axes, BLUE)
+    assert len(lines) == 3 and all(np.all(np.diff(line.get_ydata()) < 0) for line in lines)
+    assert "new law by supply voltage, 95 % band (±20 %)" in names
+    assert band_of(axes).y0 == pytest.approx(1.196 * min(lines[-1].get_ydata()), rel=1e-3)
