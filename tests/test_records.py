@@ -1,5 +1,7 @@
 """Records as people have them lead from the file to a first statement, with the columns that `inspect` proposes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from commands import command
@@ -74,10 +76,9 @@ def test_points_that_the_motors_do_not_settle_between_are_a_log(tmp_path):
     """The wheel's inertia is raised until five time constants are more than a step."""
     _, file = made("micromouse", tmp_path)
     robot = robot_file.read_robot(file)
-    columns, _ = row_checks.drop_time_of_settled_rows(
-        "t", table(3.0, 0), runs.read_runs(table(3.0, 0), robot, columns=OWN).layout, robot
-    )
-    assert "time_s" not in columns
+    read = runs.read_runs(table(3.0, 0), robot, columns=OWN)
+    log = replace(read, columns=table(3.0, 0))
+    assert log.sampled and not row_checks.without_time_of_settled_rows(log, robot).sampled
     file.write_text(file.read_text().replace("inertia = 1e-6", "inertia = 0.2"))
     heavy = robot_file.read_robot(file)
     assert row_checks.CONSTANTS_APART * row_checks.time_constant(heavy) > 3.0

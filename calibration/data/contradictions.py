@@ -8,11 +8,9 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Columns, Names
-from calibration.data.columns import DUTY, HEADING, LEVERS, SIDES, SPEED, SUPPLY, VOLTS, Layout
+from calibration.data.columns import DUTY, HEADING, LEVERS, SIDES, SPEED, SUPPLY, VOLTS
 from calibration.data.input_errors import BadData
-from calibration.data.named_arrays import check_rows
-from calibration.data.table import Runs, drive_of_sides
+from calibration.data.table import Runs
 from mmrjax.model import channels, params
 from mmrjax.model.quantities import CURRENT, RPM, TURN, VOLTAGE
 from mmrjax.model.rig import Instrument
@@ -38,38 +36,36 @@ def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None) -> tuple[np.
     return source, np.divide(volts, source, out=np.zeros_like(volts), where=source != 0)
 
 
-def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Names:
-    """Replaces the sides' voltages in a table by duties, their shares of the supply voltage.
-
-    Returns:
-        A note on the replacement. None if the table has no such column.
+def with_duties_of_sides(runs: Runs, battery: bool) -> Runs:
+    """Table with duties in place of the sides' voltages, as shares of the supply voltage, and a note on that.
 
     Raises:
         BadData: a battery feeds the motors, one side's voltage is missing, the table also states shares, or a voltage
             is higher than the supply's.
     """
-    voltage_columns = [c for c in VOLTS if c in columns]
+    voltage_columns = [c for c in VOLTS if runs.has(c)]
     if not voltage_columns:
-        return ()
+        return runs
     if battery:
         raise BadData(
-            f"{name}: column {voltage_columns[0]} together with --battery, whose voltage falls; give "
+            f"{runs.source}: column {voltage_columns[0]} together with --battery, whose voltage falls; give "
             f"{' and '.join(SIDES)} instead"
         )
-    check_commands_of_sides(name, columns, VOLTS, (*SIDES, *DUTY))
-    volts = np.stack([columns.pop(c) for c in VOLTS])
-    supply, parts = supply_and_shares(volts, columns.get(SUPPLY))
+    check_commands_of_sides(runs, VOLTS, (*SIDES, *DUTY))
+    volts = np.stack([runs[c] for c in VOLTS])
+    supply, parts = supply_and_shares(volts, runs.columns.get(SUPPLY))
     for side, row in np.argwhere(np.abs(volts) > np.abs(supply) * (1 + ROUNDED))[:1].tolist():
         raise BadData(
-            f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} V at a supply of {supply[row]:g} V; "
+            f"{runs.place(row)}, {[*VOLTS][side]}: got {volts[side, row]:g} V at a supply of {supply[row]:g} V; "
             f"expected no more than {SUPPLY}, or remove that column"
         )
-    origin = SUPPLY if SUPPLY in columns else f"{SUPPLY}, the larger of both"
-    columns |= {SUPPLY: supply, **dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))}
-    return (f"{name}: {' and '.join(VOLTS)} are read as {' and '.join(SIDES)}, shares of {origin}",)
+    origin = SUPPLY if runs.has(SUPPLY) else f"{SUPPLY}, the larger of both"
+    note = f"{runs.source}: {' and '.join(VOLTS)} are read as {' and '.join(SIDES)}, shares of {origin}"
+    duties = dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))
+    return runs.without_columns(VOLTS).with_columns({SUPPLY: supply, **duties}, note)
 
 
-def check_commands_of_sides(name: str, columns: Columns, pair: Iterable[str], whole: Iterable[str]) -> None:
+def check_commands_of_sides(runs: Runs, pair: Iterable[str], whole: Iterable[str]) -> None:
     """Rejects the command of one side alone, or of both sides twice.
 
     Args:
@@ -79,16 +75,17 @@ def check_commands_of_sides(name: str, columns: Columns, pair: Iterable[str], wh
     Raises:
         BadData: one column of the pair is missing, or another gives the command too.
     """
-    commanded = [c for c in pair if c in columns]
-    if extra := next((c for c in whole if commanded and c in columns), None):
+    commanded = [c for c in pair if runs.has(c)]
+    if extra := next((c for c in whole if commanded and runs.has(c)), None):
         raise BadData(
-            f"{name}: column {extra} in addition to {commanded[0]}, which already gives the command of both sides; "
-            "keep one"
+            f"{runs.source}: column {extra} in addition to {commanded[0]}, which already gives the command of both "
+            "sides; keep one"
         )
     if len(commanded) == 1:
         (other,) = {*pair} - {*commanded}
         raise BadData(
-            f"{name}: column {other} is missing although {commanded[0]} is present; give the command of both sides"
+            f"{runs.source}: column {other} is missing although {commanded[0]} is present; give the command of both "
+            "sides"
         )
 
 
@@ -138,24 +135,25 @@ def _refuse_against(
     )
 
 
-def unsigned_current_channels(columns: Columns, layout: Layout) -> tuple[Instrument, ...]:
-    """Instruments of the sides' currents that show no sign: their readings are positive whenever their side is driven
-    backward.
-
-    Args:
-        columns: columns of the table.
+def with_unsigned_currents(runs: Runs) -> Runs:
+    """Table with an instrument without sign for each side's current that is positive whenever its side is driven
+    backward, and a note on each.
     """
-    if not layout.sides or not set(layout.sides) <= set(columns):
-        return ()
-    unsigned = []
-    for side, drive in zip(channels.SIDES, drive_of_sides(columns, layout), strict=True):
+    layout = runs.layout
+    if not layout.sides or not all(map(runs.has, layout.sides)):
+        return runs
+    stated = {instrument.channel for instrument in layout.instruments}
+    for side, drive in zip(channels.SIDES, runs.of_sides, strict=True):
         channel = channels.find_channel(f"motor_current_{side}")
-        if channel.column in columns:
-            readings = columns[channel.column]
+        if runs.has(channel.column) and channel.name not in stated:
+            readings = runs[channel.column]
             is_backward = np.isfinite(readings) & (drive < -CLEAR * np.max(np.abs(drive)))
             if is_backward.sum() >= FEWEST - 1 and (readings[is_backward] > 0).all() and not (readings < 0).any():
-                unsigned.append(Instrument(channel.name, signed=False))
-    return tuple(unsigned)
+                note = f"{runs.source}: {channel.column} is positive although its side is driven backward"
+                instruments = (*runs.layout.instruments, Instrument(channel.name, signed=False))
+                runs = replace(runs, layout=replace(layout, instruments=instruments))
+                runs = runs.with_columns({}, f"{note}, so magnitudes are compared")
+    return runs
 
 
 #: A voltage below this share of the back-EMF cannot turn the motors at an imposed speed [-]. Least back-EMF that is
@@ -273,7 +271,7 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
             f" at an imposed {SPEED} of {runs[SPEED][row]:g}, {fault} for the motors' back-EMF of "
             f"{float(f'{back_emf[row]:.3g}'):g} V; check both columns and motor.torque_constant in the robot's file"
         )
-        check_rows(runs.source, runs.columns, [(column, wrong, why)])
+        runs.check_rows([(column, wrong, why)])
 
 
 def _check_time_order(runs: Runs) -> None:
@@ -339,4 +337,4 @@ def unwrap_angle(runs: Runs, column: str) -> Runs:
         raise BadData(f"{place}: jumps by {float(f'{step[jump]:.4g}'):g} {unit} from the sample before, {why}")
     if not note:
         return runs
-    return replace(runs, columns={**runs.columns, column: readings}, notes=(*runs.notes, note))
+    return runs.with_columns({column: readings}, note)

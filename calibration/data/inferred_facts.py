@@ -14,9 +14,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Columns
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.named_arrays import check_rows
 from calibration.data.table import Runs, rows_of_scaled_adhesion
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
@@ -46,7 +44,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, tuple[float, float, flo
     low, high = params.parameters_by_name(robot.configurations.members[0])["mass"].spec.bounds
     end = f"expected {low:g} to {high:g} kg without the payload"
     why = lambda row: f" with a payload of {payload[row]:g} kg; {end}"  # noqa: E731
-    check_rows(runs.source, runs.columns, [("total_mass_kg", (robot_mass < low) | (robot_mass > high), why)])
+    runs.check_rows([("total_mass_kg", (robot_mass < low) | (robot_mass > high), why)])
     masses = {}
     for index in np.unique(configuration_index):
         rows = configuration_index == index
@@ -166,27 +164,24 @@ def display_step(readings: np.ndarray, channel: Channel) -> float:
     return float(fits[0] * channel.factor) if fits else 0.0
 
 
-def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> tuple[Instrument, ...]:
-    """Instruments whose sign and resolution are inferred from the readings, where they are not stated.
+def infer_instruments(runs: Runs) -> Runs:
+    """Table with the sign and resolution of its instruments inferred from the readings, where they are not stated.
 
     An instrument shows only the magnitude if no reading is negative although some runs go backward.
-
-    Args:
-        columns: columns of the table, in their units.
     """
-    drives = [columns[c] for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns]
+    drives = [runs[c] for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if runs.has(c)]
     runs_backward = any((drive < 0).any() for drive in drives)
     inferred = []
-    for instrument in instruments:
+    for instrument in runs.layout.instruments:
         channel = channels.find_channel(instrument.channel)
-        readings = columns.get(channel.column, np.zeros(0))
+        readings = runs.columns.get(channel.column, np.zeros(0))
         signed, quantum = instrument.signed, instrument.quantum
         if signed is None:
             signed = not runs_backward or bool((readings < 0).any())
         if quantum is None:
             quantum = common_step(readings) * channel.factor
         inferred.append(Instrument(instrument.channel, signed, quantum))
-    return tuple(inferred)
+    return replace(runs, layout=replace(runs.layout, instruments=tuple(inferred)))
 
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:

@@ -190,7 +190,7 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
     if not runs.sampled or robot.rig.imposed != "voltage":
         return ""
     constant = time_constant(robot)
-    moving = [c for c in runs.channels if c.zero_at_rest and c.directed and runs.has(c.column)]
+    moving = [c for c in runs.present_channels if c.zero_at_rest and c.directed]
     stretches = [s.rows for run in intervals_by_run(runs) for s in run if len(s.rows) >= 4 * RISING]
     for stretch, channel in itertools.product(stretches, moving):
         readings = runs[channel.column][stretch]

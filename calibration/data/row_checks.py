@@ -8,22 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Columns, Names, configuration_tables, contradictions
+from calibration.data import configuration_tables, contradictions
 from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
-    HEADING,
     LOAD,
     SPEED,
     SPEEDS,
     SUPPLY,
     TIME,
     WHEN,
-    Layout,
 )
 from calibration.data.input_errors import BadData, rows_text, three_digits
-from calibration.data.named_arrays import Check, check_rows
-from calibration.data.table import driven_on
+from calibration.data.named_arrays import Check
+from calibration.data.table import Runs
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import VOLTAGE
@@ -110,23 +108,35 @@ SECONDS_APART, CONSTANTS_APART = 0.5, 5.0
 STILL = 0.02
 
 
-def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
-    """Adds columns that a table may omit, and rejects values that contradict each other."""
-    if not layout.complete:
-        _add_default_columns(name, columns, rows, layout)
-    check_rows(name, columns, _contradictions_in_rows(name, columns, layout))
-    if "duty" in columns:
-        columns["duty"] = np.nan_to_num(columns["duty"])
+def with_default_columns(runs: Runs) -> Runs:
+    """Table with the columns that a table of a rig may omit: its only configuration, and conditions with their usual
+    value.
+    """
+    layout, columns = runs.layout, dict[str, np.ndarray]()
+    if not runs.has("configuration") and layout.configurations:
+        labels = np.unique(runs.columns.get("surface", np.zeros(0, str)))
+        configuration = configuration_tables.common_configuration(layout.configurations, labels)
+        if configuration is None:
+            raise BadData(
+                f"{runs.source}: column configuration is missing, and the robot has "
+                f"{', '.join(layout.configurations)}"
+            )
+        columns["configuration"] = np.full(len(runs), configuration)
+    if layout.imposed_column == SPEED and all(map(runs.has, SPEEDS)):
+        columns[SPEED] = np.mean([runs[c] for c in SPEEDS], 0)
+    usual = {column: np.full(len(runs), value) for column, value in {**DEFAULTS, SUPPLY: layout.supply}.items()}
+    return runs.with_columns(columns | {c: values for c, values in usual.items() if not runs.has(c)})
 
 
-def _contradictions_in_rows(name: str, columns: Columns, layout: Layout) -> Iterator[Check]:
+def contradictions_in_rows(runs: Runs) -> Iterator[Check]:
     """Checks of values that contradict each other within a row.
 
     Raises:
         BadData: columns contradict each other.
     """
-    if "mode" in columns and not set(TIME) <= set(columns):  # motors of settled runs are driven
-        raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
+    columns = runs.columns
+    if runs.has("mode") and not runs.sampled:  # motors of settled runs are driven
+        raise BadData(f"{runs.source}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
     if "duty" in columns:
         duty, modes = columns["duty"], columns.get("mode", np.full(len(columns["duty"]), DRIVEN[0]))
         driven = modes == DRIVEN[0]
@@ -137,57 +147,71 @@ def _contradictions_in_rows(name: str, columns: Columns, layout: Layout) -> Iter
     yield "held", (clamp != 0) & (clamp != 1), "; expected 1 if a clamp holds the output, otherwise 0"
     why = "; expected 0, since the torque at a clamp is a reading: rename its column to output_torque"
     yield LOAD, (clamp == 1) & (columns.get(LOAD, 0.0) != 0), f" although held is 1{why}"
-    contradictions.check_commands_of_sides(name, columns, layout.sides, ("duty", "mode"))
+    contradictions.check_commands_of_sides(runs, runs.layout.sides, ("duty", "mode"))
     if "total_mass_kg" in columns:
         payload = columns["payload_kg"]
         yield "total_mass_kg", columns["total_mass_kg"] <= payload, lambda row: too_light(payload[row])
-    for channel in (c for c in layout.channels if c.column in columns and c.sd_column in columns):
+    for channel in (c for c in runs.present_channels if runs.has(c.sd_column)):
         lacks_sd = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
         yield channel.sd_column, lacks_sd, f" next to a reading; expected its sd, more than 0 {channel.unit}"
 
 
-def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
-    """False for each row of a log that repeats the row before it, shape (rows,), and a sentence on such rows."""
-    is_distinct = np.full(len(next(iter(columns.values()), [])), True)
-    if not set(TIME) <= set(columns):
-        return is_distinct, ()
-    again = np.flatnonzero(np.diff(columns["time_s"]) == 0) + 1
-    for values in columns.values():
+def without_repeated_rows(runs: Runs) -> Runs:
+    """Log without rows that repeat the row before, and a note on them."""
+    if not runs.sampled:
+        return runs
+    again = np.flatnonzero(np.diff(runs["time_s"]) == 0) + 1
+    for values in runs.columns.values():
         after, before = values[again], values[again - 1]
         is_equal = after == before
         if values.dtype.kind == "f":
             is_equal |= np.isnan(after) & np.isnan(before)
         again = again[is_equal]
-    is_distinct[again] = False
     if not again.size:
-        return is_distinct, ()
-    return is_distinct, (
-        f"{name}: {_rows_are(again)} a repetition of the row before, with the same time. Repetitions are left out "
-        "and not counted",
-    )
+        return runs
+    is_distinct = np.full(len(runs), True)
+    is_distinct[again] = False
+    note = f"{_rows_are(again)} a repetition of the row before, with the same time. Repetitions are left out"
+    return runs.where(is_distinct).with_columns({}, f"{runs.source}: {note} and not counted")
+
+
+def without_repeated_readings(runs: Runs) -> Runs:
+    """Log with NaN in place of repeated readings of slower sensors, and a note on each of their channels."""
+    columns, notes = dict[str, np.ndarray](), list[str]()
+    for channel in runs.present_channels if runs.sampled else ():
+        if channel.column != runs.layout.imposed_column:
+            readings = runs[channel.column]
+            values, rows = drop_repeated_readings(readings, runs["time_s"], runs.columns.get("run_id"))
+            if rows:
+                columns[channel.column] = values
+                notes.append(
+                    f"{runs.source}: {channel.column} repeats each reading in {rows:.3g} rows, like a slower sensor, "
+                    "and counts once"
+                )
+    return runs.with_columns(columns, *notes)
 
 
 def _rows_are(rows: np.ndarray) -> str:
     return f"row {rows[0] + 1} is" if rows.size == 1 else f"{rows.size} rows, the first row {rows[0] + 1}, are"
 
 
-def split_at_jumps(name: str, columns: Columns, at_rest: bool) -> Names:
-    """Gives the rows after a jump of a log's clock a run of their own. Returns a sentence if it jumps.
+def split_at_jumps(runs: Runs, at_rest: bool) -> Runs:
+    """Log whose rows after a jump of its clock are a separate run, and a note if it jumps.
 
     Args:
         at_rest: True if runs begin at rest. Rows after a jump then stay in their run.
     """
-    if not set(TIME) <= set(columns):
-        return ()
-    time = columns["time_s"]
-    run = names = columns.get("run_id", np.full(len(time), ""))
+    if not runs.sampled:
+        return runs
+    time = runs["time_s"]
+    run = names = runs.columns.get("run_id", np.full(len(time), ""))
     steps = np.where(run[1:] == run[:-1], np.diff(time), 0.0)
     usual = float(np.median(np.abs(steps))) if len(steps) else 0.0
     jumps = np.flatnonzero((steps if at_rest else np.abs(steps)) > JUMP * usual) + 1
     if usual == 0 or not 0 < len(jumps) <= MOST_JUMPS:
-        return ()
+        return runs
     first, rows = steps[jumps[0] - 1], ", ".join(str(k + 1) for k in jumps)
-    consequence = "A new run begins there"
+    columns, consequence = dict[str, np.ndarray](), "A new run begins there"
     if at_rest:
         consequence = (
             'A fit keeps the imposed quantity constant there. If rows are missing, set start = "measured" in the '
@@ -198,27 +222,12 @@ def split_at_jumps(name: str, columns: Columns, at_rest: bool) -> Names:
             after = (np.arange(len(time)) >= row) & (run == run[row])
             time = np.where(after, time - time[row], time)
             run = np.where(after, f"{names[row]} part {part}".strip(), run)
-        columns |= {"time_s": time, "run_id": run}
-    return (
-        f"{name} row {rows}, time_s: {three_digits(abs(first))} s {'after' if first > 0 else 'earlier than'} the row "
-        f"before it, where {three_digits(usual)} s is usual. {consequence}",
+        columns = {"time_s": time, "run_id": run}
+    return runs.with_columns(
+        columns,
+        f"{runs.source} row {rows}, time_s: {three_digits(abs(first))} s {'after' if first > 0 else 'earlier than'} "
+        f"the row before it, where {three_digits(usual)} s is usual. {consequence}",
     )
-
-
-def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
-    """Adds columns that a table of a rig may omit: its only configuration, and conditions with their usual value."""
-    if "configuration" not in columns and layout.configurations:
-        labels = np.unique(columns.get("surface", np.zeros(0, str)))
-        configuration = configuration_tables.common_configuration(layout.configurations, labels)
-        if configuration is None:
-            raise BadData(
-                f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
-            )
-        columns["configuration"] = np.full(rows, configuration)
-    if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
-        columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
-    for column, value in {**DEFAULTS, SUPPLY: layout.supply}.items():
-        columns.setdefault(column, np.full(rows, value))
 
 
 def too_light(payload: float) -> str:
@@ -226,57 +235,57 @@ def too_light(payload: float) -> str:
     return f"; expected more than the payload of {payload:g} kg, which it includes"
 
 
-def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
-    """Columns without the time if each row is a settled run, and a note on that.
+def without_time_of_settled_rows(runs: Runs, robot: Robot) -> Runs:
+    """Table without the time if each row is a settled run, and a note on that.
 
     Rows are then at least `CONSTANTS_APART` time constants apart. These are of the windings if a clamp holds the
     output in every row. Otherwise they are of the motors, and `_are_separate_settings` must be true.
     """
-    time = columns.get("time_s", np.zeros(0))
+    time = runs.columns.get("time_s", np.zeros(0))
     step = np.diff(time)
-    apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
+    apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(runs)
     windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
     constant = windings if clamped else time_constant(robot)
     if (
         len(time) < 3
-        or {"mode", *layout.sides} & set(columns)
+        or any(map(runs.has, ("mode", *runs.layout.sides)))
         or not math.inf > apart >= CONSTANTS_APART * constant
-        or not (clamped or _are_separate_settings(columns, layout, apart))
+        or not (clamped or _are_separate_settings(runs, apart))
     ):
-        return columns, ()
+        return runs
     why = "the output is held in every row"
     if not clamped:
         settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" * (constant > 0)
         why = f"rows are {three_digits(apart)} s or more apart, mostly at different settings{settle}"
-    columns = {c: values for c, values in columns.items() if c not in (*TIME, "run_id")}
-    return columns, (f"{name}: {why}, so each row is read as a settled run and its time is ignored",)
+    note = f"{runs.source}: {why}, so each row is read as a settled run and its time is ignored"
+    return runs.without_columns((*TIME, "run_id")).with_columns({}, note)
 
 
-def _is_clamped(columns: Columns, layout: Layout) -> bool:
+def _is_clamped(runs: Runs) -> bool:
     """True if a clamp holds the output in every row, or if an imposed speed of 0 holds it against a torque."""
-    if "held" in columns:
-        return bool((columns["held"] > 0.5).all())
-    speed = columns.get(layout.imposed_column, np.ones(1))
-    return layout.imposed == "motor_speed" and LOAD in columns and not speed.any()
+    if runs.has("held"):
+        return bool((runs["held"] > 0.5).all())
+    is_braked = runs.layout.imposed == "motor_speed" and runs.has(LOAD)
+    return is_braked and not runs.columns.get(runs.layout.imposed_column, np.ones(1)).any()
 
 
-def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bool:
+def _are_separate_settings(runs: Runs, apart: float) -> bool:
     """True if rows are at least `SECONDS_APART` apart, and half of them have another setting than the row before.
 
     Readings must follow the setting of their own row at least as well as that of the row before.
     """
-    present = [c for c in layout.channels if c.column in columns]
-    if layout.imposed != "voltage" or SUPPLY not in columns or "held" in columns or apart < SECONDS_APART:
+    if runs.layout.imposed != "voltage" or not runs.has(SUPPLY) or runs.has("held") or apart < SECONDS_APART:
         return False
-    settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
-    if not all(c.settled for c in present) or np.any([np.diff(columns[c]) != 0 for c in settings], 0).mean() < 0.5:
+    settings = [runs[c] for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if runs.has(c)]
+    changed = np.any([np.diff(x) != 0 for x in settings], 0)
+    if not all(c.settled for c in runs.present_channels) or changed.mean() < 0.5:
         return False
-    drive = columns[SUPPLY] * columns.get("duty", 1.0)
-    acting = np.stack([np.ones(len(drive)), drive, *(columns[c] for c in settings if c not in (SUPPLY, "duty"))], 1)
+    others = settings[1 + runs.has("duty") :]
+    acting = np.stack([np.ones(len(runs)), runs.commanded, *others], 1)
     return all(
-        _unexplained_squares(columns[c.column][1:], acting[1:])
-        <= 2 * _unexplained_squares(columns[c.column][1:], acting[:-1])
-        for c in present
+        _unexplained_squares(runs[c.column][1:], acting[1:])
+        <= 2 * _unexplained_squares(runs[c.column][1:], acting[:-1])
+        for c in runs.present_channels
     )
 
 
@@ -307,81 +316,69 @@ def time_constant(robot: Robot) -> float:
     return slowest * float(motor.resistance) / float(motor.torque_constant) ** 2
 
 
-def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, np.ndarray, Names]:
-    """Columns of settled runs whose motors are driven, True for these rows, and a note on the other rows.
+def without_idle_rows(runs: Runs) -> Runs:
+    """Settled runs whose motors are driven, and a note on the other rows.
 
     Raises:
-        BadData: for the same reasons as `_driven_mask`, a turn on a slope, or a reading without its sign.
+        BadData: no row is driven, a row has a speed although nothing drives its motors, a turn is on a slope, or a
+            reading lacks its sign.
     """
-    driven, notes = _driven_mask(name, columns, layout)
-    if notes:
-        columns = {column: values[driven] for column, values in columns.items()}
-    checks = [] if set(layout.sides) & set(columns) else _missing_signs(columns, layout)
-    if {*layout.sides, *HEADING} & set(columns):
-        slope = columns["slope_deg"]
+    runs = _without_idle_rows(runs)
+    if runs.turns:
+        slope = runs["slope_deg"]
         sloped = int(np.count_nonzero(slope))
         rows_text = f", as in {sloped} of {len(slope)} rows" if sloped > 1 else ""
         why = (
             f" in a table of settled turns{rows_text}; expected 0, since a turn never settles on a slope. To "
             "simulate one: simulate --model drive --left --right --slope"
         )
-        check_rows(name, columns, [("slope_deg", slope, why)])
-    check_rows(name, columns, checks)
-    return columns, driven, notes
+        runs.check_rows([("slope_deg", slope, why)])
+    if not any(map(runs.has, runs.layout.sides)):
+        runs.check_rows(_missing_signs(runs))
+    return runs
 
 
-def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, Names]:
-    """True for rows of settled runs whose motors are driven, and a sentence on the other rows.
-
-    Raises:
-        BadData: no row is driven, or a row has a speed although nothing drives its motors.
-    """
-    sides = [c for c in layout.sides if c in columns]
-    column = layout.imposed_column
-    size = np.max(np.abs([columns[c] for c in sides]), 0) if sides else np.abs(columns[column])
-    if layout.imposed == "motor_speed" and LOAD in columns:  # a shaft at rest may push against its load
-        size = size + np.abs(columns[LOAD])
-    if layout.imposed == "voltage":
-        size = size * np.abs(columns[SUPPLY] if sides else columns.get("duty", 1.0))
+def _without_idle_rows(runs: Runs) -> Runs:
+    sides, layout = [c for c in runs.layout.sides if runs.has(c)], runs.layout
+    size = np.max(np.abs([runs[c] for c in sides]), 0) if sides else np.abs(runs.commanded)
+    if layout.imposed == "motor_speed" and runs.has(LOAD):  # a shaft at rest may push against its load
+        size = size + np.abs(runs[LOAD])
+    if layout.imposed == "voltage" and sides:
+        size = size * np.abs(runs[SUPPLY])
     idle = np.flatnonzero(size == 0)
     if not idle.size:
-        return size != 0, ()
-    drive_columns = (column, *sides, *(["duty"] if "duty" in columns else []))
-    zero = " and ".join(c for c in drive_columns if not columns[c][idle].any())
+        return runs
+    drive_columns = (layout.imposed_column, *sides, *["duty"] * runs.has("duty"))
+    zero = " and ".join(c for c in drive_columns if not runs[c][idle].any())
     why = f" although {zero} is 0; give the command that drives it, or remove the row"
-    for channel in (c for c in layout.channels if c.zero_at_rest and c.column in columns):
-        readings = np.abs(np.nan_to_num(columns[channel.column]))
+    for channel in (c for c in runs.present_channels if c.zero_at_rest):
+        readings = np.abs(np.nan_to_num(runs[channel.column]))
         moving = (size == 0) & (readings > STILL * np.max(readings))
-        check_rows(name, columns, [(channel.column, moving & ~moving.all(), why)])
+        runs.check_rows([(channel.column, moving & ~moving.all(), why)])
     if idle.size == len(size):
         clamp = (
             '; if the shaft is locked, set imposed = "motor_current" or "voltage", and give the columns held '
             "(1) and output_torque"
         )
         raise BadData(
-            f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows with a "
+            f"{runs.source}: {zero} is 0 in every row, so nothing drives the motors; expected rows with a "
             f"command{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
         )
-    return size != 0, (
-        f"{name}: {_rows_are(idle)} left out, since nothing drives the motors ({zero or column} is 0). Row numbers "
-        "do not count them",
-    )
+    why = f"nothing drives the motors ({zero or layout.imposed_column} is 0)"
+    note = f"{runs.source}: {_rows_are(idle)} left out, since {why}. Row numbers do not count them"
+    return runs.where(size != 0).with_columns({}, note)
 
 
-def _missing_signs(columns: Columns, layout: Layout) -> Iterator[Check]:
+def _missing_signs(runs: Runs) -> Iterator[Check]:
     """Checks for unsigned readings in rows that drive the robot backward."""
-    imposed, unit = columns[layout.imposed_column], layout.imposed_column.split("_")[-1]
-    if layout.imposed == "voltage":
-        imposed = imposed * columns.get("duty", 1.0)
+    imposed, layout, unit = runs.commanded, runs.layout, runs.layout.imposed_column.split("_")[-1]
 
     def place(end: str) -> Callable[[int], str]:
         return lambda row: f" at {imposed[row]:g} {unit}; {end}"
 
-    may_drive = layout.weight or "duty" in columns or driven_on(columns, layout).any()
-    for channel in layout.channels:
-        if channel.column not in columns or not channel.directed:
-            continue
-        column, readings = channel.column, columns[channel.column]
+    may_drive = layout.weight or runs.has("duty") or runs.driven_on.any()
+    for channel in (c for c in runs.present_channels if c.directed):
+        column, readings = channel.column, runs[channel.column]
         if layout.magnitude(channel.name):
             why = "; expected no negative reading of an instrument that shows only the magnitude"
             yield column, readings < 0, why
@@ -389,15 +386,15 @@ def _missing_signs(columns: Columns, layout: Layout) -> Iterator[Check]:
         if may_drive and not channel.zero_at_rest:
             continue  # the load may drive a motor; a reversing bridge also reverses the supply current
         # Downhill, gravity may drive a motor. Only uphill or on the flat do current and voltage have the same sign.
-        backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
-        doubt = _sign_tolerance(columns, channel)
+        backward = (imposed < 0) & ((runs["slope_deg"] <= 0) | channel.zero_at_rest)
+        doubt = _sign_tolerance(runs, channel)
         if not channel.zero_at_rest and channel.name != "motor_voltage":  # that is compared with the back-EMF instead
             alike = "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
             why = (
                 "nothing else drives the motors, so the reading should have its sign; use one sign convention in all "
                 f"rows{alike}"
             )
-            yield column, (imposed > 0) & (columns["slope_deg"] >= 0) & (readings < -doubt), place(why)
+            yield column, (imposed > 0) & (runs["slope_deg"] >= 0) & (readings < -doubt), place(why)
         if not _rises_through_zero(imposed, readings, backward):
             why = "expected readings with their signs, negative in reverse"
             if layout.crosses_zero:
@@ -420,27 +417,26 @@ def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.
     return bool(slope * np.ptp(levels) > 2 * scatter)
 
 
-def _sign_tolerance(columns: Columns, channel: Channel) -> np.ndarray | float:
+def _sign_tolerance(runs: Runs, channel: Channel) -> np.ndarray | float:
     """Largest reading of the wrong sign that noise explains: SIGN_SDS of its sd, or a share of the channel's rms."""
-    readings = columns[channel.column]
+    readings = runs[channel.column]
     share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
-    return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
+    return np.fmax(share, SIGN_SDS * np.nan_to_num(runs.columns.get(channel.sd_column, np.zeros(len(readings)))))
 
 
-def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
+def missing_data_notes(runs: Runs) -> Iterator[str]:
     """Notes on missing channels and readings, on copies of rows, and on runs with several rows."""
-    for column in layout.measured_columns:
-        if column not in columns:
-            if layout.complete:
-                yield f"{name}: no column {column}, so this channel has no readings"
-            continue
-        empty = np.flatnonzero(np.isnan(columns[column]))
+    columns, name = runs.columns, runs.source
+    for column in runs.layout.measured_columns:
+        empty = np.flatnonzero(np.isnan(columns.get(column, np.zeros(0))))
+        if runs.layout.complete and not runs.has(column):
+            yield f"{name}: no column {column}, so this channel has no readings"
         if empty.size:
             yield (
-                f"{name}: {empty.size} of {len(columns[column])} cells of {column} are empty, the first in row "
+                f"{name}: {empty.size} of {len(runs)} cells of {column} are empty, the first in row "
                 f"{empty[0] + 1}. They are ignored"
             )
-    if set(TIME) & set(columns):
+    if runs.sampled:
         return
     alike: dict[tuple[Any, ...], list[int]] = {}
     cells_by_column = [columns[c].tolist() for c in columns if c not in ("run_id", *WHEN)]
@@ -453,10 +449,10 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
             f"{name}: rows {copied[0][0]} and {copied[0][1]} have the same conditions and readings{others}. They "
             "count as repeats. Remove copies"
         )
-    runs, times = np.unique(columns.get("run_id", np.zeros(0, str)), return_counts=True)
+    run_ids, times = np.unique(columns.get("run_id", np.zeros(0, str)), return_counts=True)
     several = times > 1
     if several.any():
-        run = runs[np.argmax(several)]
+        run = run_ids[np.argmax(several)]
         rows = rows_text(np.flatnonzero(columns["run_id"] == run).tolist(), 5, " and more").removeprefix("rows ")
         others = f", and {several.sum() - 1} more run_ids are repeated" if several.sum() > 1 else ""
         yield (
@@ -464,12 +460,12 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
         )
 
 
-def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
+def driven_backward_notes(runs: Runs) -> Iterator[str]:
     """Note on settled rows in which an unsigned load torque drives a shaft backward."""
-    on = np.flatnonzero(driven_on(columns, layout))
-    if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
+    on = np.flatnonzero(runs.driven_on)
+    if on.size and not runs.sampled and runs[LOAD].min() >= 0:
         rows_text = f", as in {on.size} rows" if on.size > 1 else ""
         yield (
-            f"{name} row {on[0] + 1}, {LOAD}: got {columns[LOAD][on[0]]:g} where the shaft is driven "
+            f"{runs.place(on[0])}, {LOAD}: got {runs[LOAD][on[0]]:g} where the shaft is driven "
             f"backward{rows_text}: here it drives the shaft. The torque of a brake is negative for backward motion"
         )

@@ -7,7 +7,7 @@ meaning, checks the values and returns `Runs`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -35,7 +35,6 @@ from calibration.data.sources import opening, reading
 from calibration.data.sources.columnar import EXPECTED
 from calibration.data.table import Runs
 from calibration.data.unused_readings import drop_computed_torques, without_held, without_unread
-from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.rig import STARTS
 from mmrjax.model.robot import NO_BRAKE, Robot
@@ -144,46 +143,39 @@ def runs_of_arrays(
         raise BadData(f"{name}: a header without rows; expected at least one run")
     arrays = clock.drop_empty_rows(arrays, meanings)
     columns, changed = _column_values(arrays, meanings, layout, battery)
-    notes = [*arrays.notes]
+    unread = {
+        c: _values_without_role(raw) for c, m, raw in zip(header, meanings, arrays.values, strict=True) if m is None
+    }
+    headings = {m.column: m.shown for m in meanings if m is not None}
+    runs = Runs(name, columns, tuple(unread), arrays.digest, unread, layout, arrays.notes, headings)
     if measured and robot is not None:
-        columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
-        notes += settled
-    notes += contradictions.duties_from_side_voltages(name, columns, battery)
-    is_kept, copied = row_checks.distinct_rows(name, columns)
-    columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
+        runs = row_checks.without_time_of_settled_rows(runs, robot)
+    runs = row_checks.without_repeated_rows(contradictions.with_duties_of_sides(runs, battery))
     if measured:
-        notes += copied
         if robot is not None:
-            notes += row_checks.split_at_jumps(name, columns, robot.rig.start == STARTS[0])
-        notes += _drop_repeats(name, columns, layout)
-    instruments = inferred_facts.infer_instruments(layout.instruments, columns)
-    unsigned = contradictions.unsigned_current_channels(columns, layout) if measured else ()
-    unsigned = tuple(i for i in unsigned if i.channel not in {instrument.channel for instrument in instruments})
-    layout = replace(layout, instruments=(*instruments, *unsigned))
-    row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)
-    if battery and layout.imposed == "voltage":
-        columns[SUPPLY] = np.full(int(is_kept.sum()), np.nan)
-    elif measured and not set(TIME) <= set(columns):  # histories may stop or roll against the motors
-        columns, driven, left_out = row_checks.driven_rows(name, columns, layout)
-        is_kept[is_kept] = driven
-        notes += left_out
-    if not any(column in columns for column in WHEN):
-        columns["order"] = np.arange(1.0, is_kept.sum() + 1)
-    unread = {c: raw for c, m, raw in zip(header, meanings, arrays.values, strict=True) if m is None}
-    extras = {column: _values_without_role(raw)[is_kept] for column, raw in unread.items()}
-    notes += [*capitals, *changed]
+            runs = row_checks.split_at_jumps(runs, robot.rig.start == STARTS[0])
+        runs = row_checks.without_repeated_readings(runs)
+    runs = inferred_facts.infer_instruments(runs)
     if measured:
-        notes += row_checks.missing_data_notes(name, columns, layout)
-    notes += [
-        f"{name}: {channels.find_channel(i.channel).column} is positive although its side is driven backward, so "
-        "magnitudes are compared"
-        for i in unsigned
-    ]
-    notes += row_checks.driven_backward_notes(name, columns, layout)
+        runs = contradictions.with_unsigned_currents(runs)
+    if not layout.complete:
+        runs = row_checks.with_default_columns(runs)
+    runs.check_rows(row_checks.contradictions_in_rows(runs))
+    if runs.has("duty"):
+        runs = runs.with_columns({"duty": np.nan_to_num(runs["duty"])})
+    if battery and layout.imposed == "voltage":
+        runs = runs.with_columns({SUPPLY: np.full(len(runs), np.nan)})
+    elif measured and not runs.sampled:  # histories may stop or roll against the motors
+        runs = row_checks.without_idle_rows(runs)
+    if not any(map(runs.has, WHEN)):
+        runs = runs.with_columns({"order": np.arange(1.0, len(runs) + 1)})
+    notes = [*capitals, *changed]
+    if measured:
+        notes += row_checks.missing_data_notes(runs)
+    notes += row_checks.driven_backward_notes(runs)
     if measured and robot is not None:
         notes += column_names.unread_channel_notes(name, robot, unread)
-    headings = {m.column: m.shown for m in meanings if m is not None}
-    runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, tuple(notes), headings)
+    runs = runs.with_columns({}, *notes)
     if robot is None:
         return runs
     runs = contradictions.check_contradictions(runs, robot)
@@ -220,7 +212,7 @@ def _column_values(
             bad.append((k, j, column_names.refused_cell_sentence(arrays.row(k), meaning, cell, layout)))
     if bad:
         raise BadData(_join_cell_messages(arrays.name, [sentence for _, _, sentence in sorted(bad)], count))
-    return columns, tuple(notes)
+    return {c: values for c, values in columns.items() if c != "held" or values.any()}, tuple(notes)
 
 
 def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
@@ -238,21 +230,6 @@ def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
         repeats.add(cure)
     rest = f"; and {count - LISTED} more" if count > LISTED else ""
     return f"{first}; also {'; '.join(more)}{rest}" if more else first
-
-
-def _drop_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
-    """Replaces repeated readings of a log by NaN in its columns. Yields a sentence on each channel."""
-    if not set(TIME) <= set(columns):
-        return
-    run = columns.get("run_id")
-    for channel in (c for c in layout.channels if c.column in columns and c.column != layout.imposed_column):
-        values, rows = row_checks.drop_repeated_readings(columns[channel.column], columns["time_s"], run)
-        if rows:
-            columns[channel.column] = values
-            yield (
-                f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, like a slower sensor, and "
-                "counts once"
-            )
 
 
 def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], Names]:

@@ -311,9 +311,7 @@ def _settled_signals_of_log(
 ) -> tuple[Signal, ...]:
     """Returns the readings of each channel of settled runs. If only an angle is measured, its rate."""
     width = min(max(6 * half, BESIDE[0]), BESIDE[1])
-    sources = [
-        (c, c, 0.0) for c in runs.channels if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any()
-    ]
+    sources = [(c, c, 0.0) for c in runs.present_channels if c.settled and np.isfinite(runs[c.column]).any()]
     read_directly = {c.name for c, _, _ in sources}
     for angle, rate, factor in RATES:
         if rate not in read_directly and runs.has(angle):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from calibration.data.columns import (
     Layout,
 )
 from calibration.data.input_errors import BadData, allowed_words, rows_text
+from calibration.data.named_arrays import Check, check_rows
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -45,25 +46,6 @@ def rows_of_scaled_adhesion(robot: Robot, configurations: np.ndarray, labels: np
         for name, label in set(pairs)
     }
     return np.array([of_table5[pair] for pair in pairs], bool)
-
-
-def driven_on(columns: Columns, layout: Layout) -> np.ndarray:
-    """True for rows whose stated load torque acts in the direction of the drive, shape (rows,)."""
-    imposed = columns[layout.imposed_column] * (columns.get("duty", 1.0) if layout.imposed == "voltage" else 1.0)
-    return columns[LOAD] * imposed < 0 if LOAD in columns else np.zeros(len(imposed), bool)
-
-
-def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
-    """Voltage of left and right side [V] (on a battery, duty), or their speed [rpm], shape (2, rows). Negative in
-    reverse.
-
-    Args:
-        columns: columns of a table that turns.
-    """
-    alike = np.ones(len(next(iter(columns.values()))))
-    side_drives = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
-    supply = columns.get(SUPPLY, alike) if layout.imposed == "voltage" else alike
-    return side_drives * np.where(np.isnan(supply), 1.0, supply)
 
 
 @dataclass(frozen=True)
@@ -104,6 +86,18 @@ class Runs:
         """True if the table has this column."""
         return column in self.columns
 
+    def with_columns(self, columns: Columns, *notes: str) -> Runs:
+        """Table with further or other columns, and further notes."""
+        return replace(self, columns={**self.columns, **columns}, notes=(*self.notes, *notes))
+
+    def check_rows(self, checks: Iterable[Check]) -> None:
+        """Runs checks of its rows, see `named_arrays.check_rows`."""
+        check_rows(self.source, self.columns, checks)
+
+    def without_columns(self, names: Collection[str]) -> Runs:
+        """Table without these columns."""
+        return replace(self, columns={name: values for name, values in self.columns.items() if name not in names})
+
     def place(self, first: int, last: int | None = None) -> str:
         """Source and row, or rows, counted from 1, for the beginning of a message."""
         rows = f"row {first + 1}" if last is None else f"rows {first + 1} to {last + 1}"
@@ -120,13 +114,34 @@ class Runs:
 
     @property
     def of_sides(self) -> np.ndarray:
-        """See `drive_of_sides`. For a table with `turns`."""
-        return drive_of_sides(self.columns, self.layout)
+        """Voltage of left and right side [V] (on a battery, duty), or their speed [rpm], shape (2, rows). Negative in
+        reverse. For a table with `turns`.
+        """
+        columns, alike = self.columns, np.ones(len(self))
+        side_drives = np.stack([columns.get(name, columns.get("duty", alike)) for name in self.layout.sides])
+        supply = columns.get(SUPPLY, alike) if self.layout.imposed == "voltage" else alike
+        return side_drives * np.where(np.isnan(supply), 1.0, supply)
+
+    @property
+    def commanded(self) -> np.ndarray:
+        """The imposed quantity, times the duty if that is the voltage, shape (rows,)."""
+        duty = self.columns.get("duty", 1.0) if self.layout.imposed == "voltage" else 1.0
+        return self[self.layout.imposed_column] * duty
+
+    @property
+    def driven_on(self) -> np.ndarray:
+        """True for rows whose stated load torque acts in the direction of the drive, shape (rows,)."""
+        return self.columns.get(LOAD, 0.0) * self.commanded < 0
 
     @property
     def channels(self) -> tuple[Channel, ...]:
         """Channels of its readings, in the order of arrays."""
         return self.layout.channels
+
+    @property
+    def present_channels(self) -> tuple[Channel, ...]:
+        """Channels for which it has a column."""
+        return tuple(c for c in self.channels if self.has(c.column))
 
     def of(self, robot: Robot) -> Runs:
         """Table with the channels of a robot. Columns of other channels are not used by the model.
@@ -146,8 +161,7 @@ class Runs:
         other_columns = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - own_columns
         remaining_columns = {name: values for name, values in self.columns.items() if name in other_columns}
         return replace(
-            self,
-            columns={name: values for name, values in self.columns.items() if name not in remaining_columns},
+            self.without_columns(remaining_columns),
             unknown=(*self.unknown, *remaining_columns),
             extras={**self.extras, **remaining_columns},
             layout=replace(self.layout, channels=robot.channels),
@@ -166,7 +180,7 @@ class Runs:
     def pulled(self) -> bool:
         """True if gravity, a constant torque or a load motor may drive the motors."""
         sloped = self.has("slope_deg") and bool(self["slope_deg"].any())
-        return self.layout.weight or sloped or bool(driven_on(self.columns, self.layout).any())
+        return self.layout.weight or sloped or bool(self.driven_on.any())
 
     def turns_round(self, channel: Channel) -> bool:
         """True if a channel's readings have the sign of what drives the motors.

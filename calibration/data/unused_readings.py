@@ -41,7 +41,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
         BadData: the load of a log is computed, the current is imposed, or there is no other channel.
     """
     columns, notes = dict(runs.columns), list(runs.notes)
-    channels_by_column = {c.column: c.name for c in runs.channels if runs.has(c.column)}
+    channels_by_column = {c.column: c.name for c in runs.present_channels}
     for torque, current in itertools.product((LOAD, TORQUE), CURRENTS):
         if torque not in columns or not runs.has(current) or (torque == TORQUE and len(channels_by_column) < 2):
             continue
@@ -124,7 +124,7 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
     drive = np.abs(applied_drive(runs))
     is_limited = _beyond_limit(runs, drive)
     unread = _turning_mask(runs, robot, drive) & ~is_limited
-    for channel in (c for c in runs.channels if runs.has(c.column)):
+    for channel in runs.present_channels:
         not_read = unread & (runs[channel.column] == 0) & channel.zero_at_rest
         columns[channel.column] = np.where(is_limited | not_read, np.nan, runs[channel.column])
         if not_read.any():
@@ -204,7 +204,7 @@ def without_held(runs: Runs) -> Runs:
     if not (runs.sampled and runs.has(runs.layout.imposed_column)):
         return runs
     columns, notes, drive = dict(runs.columns), dict[str, str](), np.nan_to_num(applied_drive(runs))
-    present_channels = [c for c in runs.channels if runs.has(c.column) and c.rests_on != VOLTAGE]
+    present_channels = [c for c in runs.present_channels if c.rests_on != VOLTAGE]
     # Others are frozen from the start.
     changing = [c for c in present_channels if np.ptp(np.nan_to_num(runs[c.column])) > 0]
     for rows, channel in itertools.product(runs.rows_by_run().values(), changing):
@@ -227,7 +227,7 @@ def without_held(runs: Runs) -> Runs:
                 f"{runs.place(stretch[0], stretch[-1])}, {runs.heading(column)}: the same "
                 f"reading while {drive_heading(runs)} changes, like repeats. {cure}"
             )
-    return replace(runs, columns=columns, notes=(*runs.notes, *notes.values()))
+    return runs.with_columns(columns, *notes.values())
 
 
 #: Number of rows at the start of a run that are always used, because they show its initial state.

@@ -140,8 +140,7 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> Remark | None:
 def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
     """Remarks on channels that are a linear function of another channel in all rows, to the digits of the file."""
     copied, copies = list[Remark](), set[str]()
-    names = [c for c in runs.channels if runs.has(c.column)]
-    for one, other in itertools.combinations(names, 2):
+    for one, other in itertools.combinations(runs.present_channels, 2):
         if {one.name, other.name} & copies:
             continue
         x, y = np.asarray(runs[one.column], float), np.asarray(runs[other.column], float)

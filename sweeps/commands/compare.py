@@ -52,7 +52,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     else:
         robot = inferred_facts.with_inferred_instruments(file.robot, runs)
         if beside.own_mass:
-            runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
+            runs = runs.without_columns(["total_mass_kg"])
         remarks = tuple(check_ranges(runs, robot))
         other = None if second is None else inferred_facts.with_inferred_instruments(second.robot, runs)
         posterior = None if config.posterior is None else posterior_beside_robot(file)

@@ -275,7 +275,7 @@ class Histories(Observer):
         # Current rises within a millisecond; speeds and angles do not.
         resting = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
         moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
-        for channel in (c for c in runs.channels if not c.over_time and runs.has(c.column)):
+        for channel in (c for c in runs.present_channels if not c.over_time):
             raise BadData(
                 f"{runs.source}, {channel.column}: not modelled over time; remove the column, or give settled "
                 "runs without time_s"
