@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
@@ -55,10 +55,19 @@ MOST_GLITCHES, BESIDE = 0.25, (21, 101)
 OF_YAW = tuple(c.name for c in channels.OF_TURNS if c.directed and c.side is None)
 #: Conditions that end a stretch whenever they change.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
-#: Reasons for omitting samples.
-REASONS = (
-    "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "glitches", "unread", "undriven",
-)  # fmt: skip
+#: Reasons for omitting samples: finding and advice.
+REASONS = {
+    "changes": ("the imposed quantity always changes", "hold each level for a while"),
+    "short": ("the level is held too briefly", "hold it longer, or lower --shortest"),
+    "settling": ("still changes at the end of its level", "hold it longer, or raise --drift"),
+    "accelerates": ("still accelerates at the end of its level", "hold it longer, or raise --drift"),
+    "idle": ("nothing drives the motors", "nothing"),
+    "rest": ("the drive does not move", "nothing, friction holds the drive"),
+    "stuck": ("is saturated or frozen", "check the instrument"),
+    "glitches": ("has many outliers", "check the instrument, or log a mean of pulses"),
+    "unread": ("no channel has enough readings", "log more, or remove these rows"),
+    "undriven": ("the driver brakes or coasts", "nothing, a fit to the log uses them"),
+}
 
 
 @dataclass(frozen=True)
@@ -128,6 +137,12 @@ class Stretch:
     def lasts(self) -> float:
         """Duration [s]."""
         return self.end - self.begin
+
+    @property
+    def reason(self) -> str:
+        """Reason why it is left out: `total_current still changes at the end of its level (6.1 %)`."""
+        size_text = f" ({100 * self.size:.2g} %)" if self.size else ""
+        return f"{self.channel} {REASONS[self.why][0]}{size_text}".strip()
 
 
 @dataclass(frozen=True)
@@ -214,21 +229,18 @@ def settle_log(
 
     Args:
         robot: robot of the log. Stretches in which its acceleration takes more than `drift` of the current are
-            omitted, and units are checked with its ratios. None: without both.
+            omitted. None: no stretch is.
         shortest: shortest stretch [s]. None: 0.3 s, and at least 20 samples.
         drift: largest change within a stretch, as a share of the mean.
 
     Raises:
-        BadData: time does not increase, a channel has a single value, or there is no stretch. Also if speeds or
-            currents have no sign, or speeds or rates of angles are in other units than their columns state.
+        BadData: time does not increase, there is no stretch, or speeds or currents have no sign.
     """
     result = _divide_log(runs, shortest, drift, {} if robot is None else acceleration_currents(robot))
     if not result.kept:
         raise BadData(_nothing_settled_message(result))
     if doubt := _sign_doubt(result):  # from their own sds, because repeats with different signs widen the final ones
         raise BadData(doubt)
-    if robot is not None and not runs.turns:  # the sides of a turn have different speeds
-        _check_units(result, rolling_readings(robot))
     return replace(
         result,
         stretches=tuple(
@@ -265,8 +277,6 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
     for driver in (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else [])):
         levels = [x for level in levels for x in _levels_of(runs, driver, level, shortest, drift, step)]
     signals = _settled_signals_of_log(runs, rows_by_run, levels, max(1, round(shortest / 6 / step)), drift)
-    for signal in signals:
-        _check_alive(runs, signal)
     stuck = np.array([_stuck_rows(s, rows_by_run) for s in signals])
     stretches = tuple(
         _settled_end(runs, signals, drives, level, shortest, drift, step, stuck, inertia) for level in levels
@@ -400,22 +410,9 @@ def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> floa
     return float(np.median(np.diff(levels)[np.diff(levels) < 1.5 * np.diff(levels).min()])) if coarse else 0.0
 
 
-def _check_alive(runs: Runs, signal: Signal) -> None:
-    finite_values = signal.shown[np.isfinite(signal.shown)]
-    if len(finite_values) > STUCK and np.ptp(finite_values) == 0:
-        column, value, unit = signal.channel.column, finite_values[0], signal.channel.unit
-        if len(signal.angle):
-            column, _, factor = next(x for x in RATES if x[1] == signal.channel.name)
-            value, unit = signal.angle[np.isfinite(signal.angle)][0] / factor, column.rpartition("_")[2]
-        raise BadData(
-            f"{runs.source} rows 1 to {len(runs)}, {column}: {value:g} {unit} in every row: frozen or not "
-            "connected; remove the column, or its channel from the rig's file"
-        )
-
-
 def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
-    """Rows in which a channel repeats one number for longer than noise allows: saturated or frozen."""
-    is_stuck = np.zeros(len(signal.shown), bool)
+    """Rows in which a channel shows only 0 or repeats one number for longer than noise allows."""
+    is_stuck = np.full(len(signal.shown), signal.largest == 0)
     for rows in each if not len(signal.angle) else ():
         readings = signal.shown[rows]
         repeats = np.diff(readings) == 0
@@ -745,14 +742,6 @@ def _point_of(runs: Runs, stretch: Stretch) -> tuple[object, ...]:
 
 #: A mean has a sign if it is at least this far from zero [sds].
 SIGNED = 5.0
-#: Factors between units of speed, and relative tolerance for a match.
-UNITS = {
-    "degrees for radians": 180 / math.pi, "radians for degrees": math.pi / 180, "deg/s for rpm": 6.0,
-    "rpm for deg/s": 1 / 6, "rad/s for rpm": math.pi / 30, "rpm for rad/s": 30 / math.pi,
-    "turns for degrees": 1 / 360, "degrees for turns": 360.0, "turns/s for rpm": 1 / 60, "rpm for turns/s": 60.0,
-    "m for mm": 1e-3, "mm for m": 1e3,
-}  # fmt: skip
-NEAR = 0.03
 
 
 def _place_text(found: Settled, s: Stretch, channel: Channel) -> str:
@@ -764,105 +753,36 @@ def _place_text(found: Settled, s: Stretch, channel: Channel) -> str:
     )
 
 
-def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:
-    """Rejects speeds and rates of angles that differ from another channel by the ratio of two units."""
-    runs = found.runs
-    angles = {rate: angle for angle, rate, _ in RATES}
-    # The angle is suspected first, since its rate is not read directly.
-    names = [s.channel.name for s in sorted(found.signals, key=lambda s: not len(s.angle))]
-    for s in found.kept:
-        units = rolling.get(str(runs["configuration"][s.rows[0]]), {})
-        turns = {name: abs(s.mean[name] / units[name]) for name in names if units.get(name)}
-        if runs.layout.imposed == "motor_speed":
-            turns["motor_speed"] = abs(s.imposed) * math.pi / 30
-        for (one, turns_of_one), (other, turns_of_other) in combinations(turns.items(), 2):
-            if not (turns_of_one > 0 and turns_of_other > 0):
-                continue
-            ratio = turns_of_one / turns_of_other
-            unit = next((word for word, x in UNITS.items() if abs(math.log(ratio / x)) < NEAR), None)
-            if unit is not None:
-                column = channels.find_channel(one).column
-                if not runs.has(column):
-                    column = angles.get(one, column)
-                raise BadData(
-                    f"{runs.place(s.rows[0], s.rows[-1])}, {column}: {ratio:.4g} times the value "
-                    f"that {channels.find_channel(other).column} and the gear ratio of the rig's file imply; is "
-                    f"it in {unit}? convert all rows to the unit in the column name, or set [columns] {column} = "
-                    f"{{column = ..., factor = {1 / ratio:.3g}}} in the rig's file"
-                )
-
-
-def _nothing_settled_message(found: Settled) -> str:
-    """Message on a log without settled stretches: main reason and advice."""
-    instead = "give one command for straight travel" if found.runs.turns else "use the log itself with loop"
-    source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
-    whys = [s.why for s in found.stretches]
-    why = max(dict.fromkeys(whys), key=lambda w: sum(s.lasts for s in found.stretches if s.why == w))
-    rows = f"rows {longest.rows[0] + 1} to {longest.rows[-1] + 1}"
-    if why in ("changes", "short"):
-        step = longest.lasts / max(len(longest.rows) - 1, 1)
-        longest_text, least_text = f"{longest.lasts:.3g} s", f"{found.shortest:.3g} s"
-        cure = "hold each level longer or set a smaller --shortest"
-        if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # too few samples
-            needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
-            longest_text, least_text = count_noun(len(longest.rows), "sample"), f"{needed}"
-            cure = (
-                "log faster, hold each level longer (for --shortest and at least "
-                f"{FEWEST} samples), or remove time_s if each row is a settled run already"
-            )
-        return (
-            f"{source}: no settled segment: the longest level has {longest_text} ({rows}); expected at least "
-            f"{least_text}; {instead}, or {cure}"
-        )
-    if why in ("settling", "accelerates"):
-        return (
-            f"{source}: never settles: at the end of its longest level ({rows}) {longest.channel or 'a channel'} "
-            f"still changes by {100 * longest.size:.2g} % (allowed: {100 * found.drift:g} %); {instead}, or hold "
-            "each level longer or set a larger --drift"
-        )
-    if why == "unread":
-        filled_shares = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
-        return (
-            f"{source}: no settled segment: no channel has enough readings ({filled_shares} of the rows); each level "
-            f"needs at least {FEWEST}; {instead}, or log them more often"
-        )
-    imposed = found.runs.layout.imposed_column
-    message_of_reason = {
-        "idle": (
-            f"{imposed} is about zero, so nothing drives the motors. Log driven rows, or name the command "
-            "under [columns]"
-        ),
-        "rest": "no level shows motion above the noise. Use larger commands",
-        "stuck": (f"{longest.channel} shows one number for a long time. Repair the instrument or change its range"),
-        "glitches": f"{longest.channel} has many outlying readings. Repair the instrument, or log its mean",
-        "undriven": "the driver brakes or coasts in every row. Log driven rows",
-    }
-    return f"{source} {rows}, no settled segment: {message_of_reason[why]}"
+def _nothing_settled_message(log: Settled) -> str:
+    """Message on a log without settled stretches: the reason that omits most of its time, and advice."""
+    by_reason = {why: [s for s in log.stretches if s.why == why] for why in REASONS}
+    why = max(by_reason, key=lambda why: sum(s.lasts for s in by_reason[why]))
+    longest = max(by_reason[why], key=lambda s: s.lasts)
+    advice = REASONS[why][1]
+    cure = "log driven motion" if advice.startswith("nothing") else advice
+    instead = "give one command for straight travel" if log.runs.turns else "use the log itself with loop"
+    place = log.runs.place(longest.rows[0], longest.rows[-1])
+    return (
+        f"{place}: no settled segment: {longest.reason}. This level has {longest.lasts:.3g} s and "
+        f"{count_noun(len(longest.rows), 'sample')}; expected at least {log.shortest:.3g} s and {FEWEST} samples; "
+        f"{cure}, or {instead}"
+    )
 
 
 # --- properties of the robot that settling needs ---
 
 
-def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
-    """Speed readings of each configuration while the motors turn at 1 rad/s without slip [unit of the column].
-
-    By channel. For vehicles, only speeds of shafts, because the ground speed depends on slip.
-    """
-    shafts = {
-        c.name for c in settled_channels(robot) if c.zero_at_rest and not (c.name == "speed" and robot.has_ground)
-    }
-    return {
-        name: {n: x for n, x in _readings_of_one(robot, k)[1].items() if n in shafts}
-        for k, name in enumerate(robot.configurations)
-    }
-
-
 def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     """Current that acceleration takes in each configuration, if known."""
     constant, inertias = float(robot.motor.torque_constant), {}
+    zero, one = jnp.zeros(()), jnp.ones(())
     for k, (name, load) in enumerate(robot.configurations.items()):
-        at_motor = inertia_at_motor(robot, load)
-        currents, speeds = _readings_of_one(robot, k)
+        at_motor, rolling = (
+            inertia_at_motor(robot, load),
+            jnp.asarray(float(load.radius) / float(robot.gearbox.ratio)),
+        )
+        currents = _settled_readings(robot, k, State(one, zero, zero, zero))
+        speeds = _settled_readings(robot, k, State(zero, one, rolling, zero))
         current = next((n for n, x in currents.items() if x and not speeds[n]), "")
         speed = next((n for n, x in speeds.items() if x), "")
         is_known = current or robot.rig.imposed == "motor_current"
@@ -872,19 +792,12 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     return inertias
 
 
-def _readings_of_one(robot: Robot, configuration: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Readings of the settled channels [unit of the column] at 1 A at rest, and while the motors turn at 1 rad/s
-    without slip and current. 0 for channels that depend on more than the state.
-    """
-    zero, one = jnp.zeros(()), jnp.ones(())
-    rolling = float(robot.configurations.members[configuration].radius) / float(robot.gearbox.ratio)
-    readings: tuple[dict[str, float], dict[str, float]] = ({}, {})
-    states = State(one, zero, zero, zero), State(zero, one, jnp.asarray(rolling), zero)
-    for by_name, state in zip(readings, states, strict=True):
-        signals = balances.begin_signals(robot, Conditions(configuration), state)
-        for channel in settled_channels(robot):
-            try:
-                by_name[channel.name] = float(channel.read(robot, signals)) / channel.factor
-            except (AttributeError, TypeError):  # a signal that the balances fill in
-                by_name[channel.name] = 0.0
+def _settled_readings(robot: Robot, configuration: int, state: State) -> dict[str, float]:
+    """Readings of the settled channels in a state [unit of the column]. 0 for channels that depend on more."""
+    signals, readings = balances.begin_signals(robot, Conditions(configuration), state), {}
+    for channel in settled_channels(robot):
+        try:
+            readings[channel.name] = float(channel.read(robot, signals)) / channel.factor
+        except (AttributeError, TypeError):  # a signal that the balances fill in
+            readings[channel.name] = 0.0
     return readings

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 from calibration.data import Names
 from calibration.data.input_errors import rows_text
-from calibration.data.settling import RATES, Settled, Stretch
+from calibration.data.settling import RATES, REASONS, Settled, Stretch
 from mmrjax.errors import count_noun
 
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
@@ -199,31 +199,6 @@ SAID: dict[str, str | Callable[..., str]] = {
 
 #: Reasons that do not apply where the log itself is fitted, and the advice then.
 OF_LEVELS = ("changes", "short", "settling", "accelerates")
-#: Finding and advice for each of `settling.REASONS`.
-WHY = {
-    "changes": ("the imposed quantity always changes", "hold each level for a while"),
-    "short": ("the level is held too briefly", "hold it longer, or lower --shortest"),
-    "settling": ("still changes at the end of its level", "hold it longer, or raise --drift"),
-    "accelerates": ("still accelerates at the end of its level", "hold it longer, or raise --drift"),
-    "idle": ("nothing drives the motors", "nothing"),
-    "rest": ("the drive does not move", "nothing, friction holds the drive"),
-    "stuck": (
-        "is saturated or frozen",
-        "check the instrument",
-    ),
-    "glitches": (
-        "has many outliers",
-        "check the instrument, or log a mean of pulses",
-    ),
-    "unread": ("no channel has enough readings", "log more, or remove these rows"),
-    "undriven": ("the driver brakes or coasts", "nothing, a fit to the log uses them"),
-}
-
-
-def left_out_reason(stretch: Stretch) -> str:
-    """Reason why a stretch is left out: `total_current still changes at the end of its level (6.1 %)`."""
-    reason = f"{stretch.channel} {WHY[stretch.why][0]}" if stretch.channel else WHY[stretch.why][0]
-    return reason + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
 
 
 def omitted_stretches(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str, int, int, str, str]]:
@@ -238,10 +213,10 @@ def omitted_stretches(stretches: Iterable[Stretch], few: bool = False) -> list[t
         stretches_of_reason = [s for s in omitted if s.why == why]
         longest = max(stretches_of_reason, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
-        cure = "nothing, a fit to the log uses them" if few and why in OF_LEVELS else WHY[why][1]
+        cure = "nothing, a fit to the log uses them" if few and why in OF_LEVELS else REASONS[why][1]
         causes.append(
             (
-                left_out_reason(longest),
+                longest.reason,
                 len(stretches_of_reason),
                 sum(len(s.rows) for s in stretches_of_reason),
                 rows,

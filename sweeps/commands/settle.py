@@ -45,7 +45,7 @@ def segments_table(found: Settled) -> Columns:
         "first_row": np.array([s.rows[0] + 1 for s in stretches]),
         "last_row": np.array([s.rows[-1] + 1 for s in stretches]),
         "imposed": np.array([s.imposed for s in stretches]),
-        "left_out": np.array([table_words.left_out_reason(s) if s.why else "" for s in stretches]),
+        "left_out": np.array([s.reason if s.why else "" for s in stretches]),
     }
     for signal in found.signals:
         channel = signal.channel
