@@ -47,7 +47,7 @@ def test_a_record_is_read_with_the_columns_that_inspect_proposes(name, tmp_path)
     read_file = robot_file.read_robot(file)
     read = runs.read_runs(data, read_file)
     assert (len(read), not read.sampled) == READ[name]
-    assert not rig_facts.doubtful_time(read, read_file) and not rig_facts.doubtful_speed(read, read_file)
+    assert not rig_facts.doubtful_time(read, read_file)
 
 
 #: Columns of a table whose names are this program's.

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import configuration_tables, inferred_facts, rig_facts, robot_file
+from calibration.data import configuration_tables, inferred_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, three_digits
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import bases, blocks, checks, noise, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
@@ -671,16 +671,7 @@ def motor_table(resistance, constant, friction, voltages):
 def test_motors_far_from_the_packaged_one_are_read_without_a_doubt(tmp_path, numbers, voltages):
     rig = read_rig(tmp_path, MOTOR.format(resistance=numbers[0], constant=numbers[1], friction=numbers[2]))
     runs = records.read_runs(motor_table(*numbers, voltages), rig)
-    assert len(runs) == len(voltages) and rig_facts.doubtful_speed(runs, rig) == ""
-
-
-@pytest.mark.parametrize("column, factor", [("motor_speed_rpm", 60.0), ("supply_voltage_V", 1000.0)])
-def test_a_speed_that_the_constant_cannot_give_is_doubted_with_its_number(tmp_path, column, factor):
-    rig = read_rig(tmp_path, MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
-    table = motor_table(0.4, 0.05, 0.01, [6, 9])
-    runs = records.read_runs({**table, column: factor * table[column]}, rig)
-    reached = factor * 6 / 0.05 * 30 / np.pi if column == "supply_voltage_V" else 6 / 0.05 * 30 / np.pi
-    assert f"the motors reach at most {three_digits(reached)} rpm" in rig_facts.doubtful_speed(runs, rig)
+    assert len(runs) == len(voltages) and not check_ranges(runs, rig)
 
 
 def test_an_offset_of_an_ammeter_is_no_lost_sign(tmp_path):

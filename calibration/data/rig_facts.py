@@ -11,13 +11,13 @@ import numpy as np
 
 from calibration.data import Names, rig_file
 from calibration.data.clock import applied_drive, changing_columns, intervals_by_run
-from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
+from calibration.data.columns import CURRENT, LOAD, SPEED
 from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
 from calibration.data.row_checks import JUMP, time_constant
 from calibration.data.runs import Runs
 from calibration.data.unused_readings import drive_heading
-from mmrjax.model import channels, params
+from mmrjax.model import params
 from mmrjax.model.gearmotor import slow_motor_current, slow_output_torque
 from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot
@@ -25,7 +25,6 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY
 
 BATTERY = "battery"
-OUTPUT_SPEED = channels.find_channel("output_speed").column
 #: Smallest ratio of gearboxes with three or more stages, and the largest efficiency that makers state for them.
 STAGES, EFFICIENCY = 100.0, 0.85
 #: Shortest change of speed that the inertia of motors and load does not explain [time constants]. Fewest samples.
@@ -329,37 +328,6 @@ def saturation_sentence(runs: Runs) -> str:
     )
 
 
-#: Ratio of the speed to the one that follows from the robot file, beyond which a unit is doubted.
-OTHER_UNIT = 3.0
-
-
-def doubtful_speed(runs: Runs, robot: Robot) -> str:
-    """Reason to doubt the unit of the imposed voltage or of the speed, empty without evidence.
-
-    The speed is far above the one at which the back-EMF equals the voltage. A load lowers the speed, so a speed that
-    is too small shows only in rows without current or brake torque.
-    """
-    column = next((c for c in (SPEED, OUTPUT_SPEED) if runs.has(c)), None)
-    if robot.rig.imposed != "voltage" or not robot.knows(VOLTAGE) or column is None:
-        return ""
-    ratio = float(robot.gearbox.ratio) if column == OUTPUT_SPEED else 1.0
-    highest = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
-    speed = np.abs(np.nan_to_num(runs[column]))
-    rows = np.flatnonzero((speed > 0) & (highest > 0))
-    if not rows.size:
-        return ""
-    share = float(np.median(speed[rows] / highest[rows]))
-    braked = runs.has(LOAD) and bool((runs[LOAD] != 0).all())
-    if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
-        return ""
-    row, (heading, supply) = int(rows[0]), map(runs.heading, (column, SUPPLY))
-    return (
-        f"{runs.place(row)}, {heading}: got {three_digits(speed[row])} rpm, but with the file's torque constant the "
-        f"motors reach at most {three_digits(highest[row])} rpm; check the units of {heading} and {supply}, and "
-        "motor.torque_constant"
-    )
-
-
 #: Brake torque beyond which another unit is suspected, in multiples of the stall torque.
 BEYOND = 3.0
 
@@ -423,7 +391,7 @@ def swapped_sentence(runs: Runs) -> str:
 def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Doubts about a log, one sentence each: times, levels, limits, and units that do not fit the robot."""
     of_runs = (jitter_sentence, saturation_sentence, constant_conditions_sentence, swapped_sentence)
-    of_robot = (doubtful_time, doubtful_current, doubtful_torque, doubtful_speed)
+    of_robot = (doubtful_time, doubtful_current, doubtful_torque)
     doubts = (*(doubt(runs) for doubt in of_runs), *(doubt(runs, robot) for doubt in of_robot))
     return tuple(filter(None, doubts))
 
