@@ -429,7 +429,7 @@ def missing_data_notes(runs: Runs) -> Iterator[str]:
     columns, name = runs.columns, runs.source
     for column in runs.layout.measured_columns:
         empty = np.flatnonzero(np.isnan(columns.get(column, np.zeros(0))))
-        if runs.layout.complete and not runs.has(column):
+        if not runs.has(column):
             yield f"{name}: no column {column}, so this channel has no readings"
         if empty.size:
             yield (

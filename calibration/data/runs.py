@@ -44,7 +44,7 @@ __all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "read_runs", "runs
 
 #: Tables that come with the package.
 PACKAGED = {"measured": "measured.csv", "simulated_by_paper": "simulated_by_paper.csv"}
-#: Most rejected cells that a message lists.
+#: Most rejected cells that a message names.
 LISTED = 8
 
 
@@ -187,7 +187,7 @@ def _column_values(
 ) -> tuple[Columns, Names]:
     """Values of the known columns, and notes on changed cells."""
     columns: Columns = {}
-    bad: list[tuple[int, int, str]] = []
+    bad: list[tuple[int, int, Column, Raw]] = []
     notes: list[str] = []
     count = 0
     by_name = {m.column: raw for m, raw in zip(meanings, arrays.values, strict=True) if m is not None}
@@ -205,31 +205,15 @@ def _column_values(
             _reject_readings(arrays, meaning, raw, layout)
             continue
         columns[meaning.column], refused = column_names.convert_column(meaning, raw, layout)
-        wrong = np.flatnonzero(refused).tolist()
-        count += len(wrong)
-        for k in wrong[:LISTED]:
-            cell = column_texts(raw[k : k + 1])[0]
-            bad.append((k, j, column_names.refused_cell_sentence(arrays.row(k), meaning, cell, layout)))
+        count += int(refused.sum())
+        bad += [(row, j, meaning, raw) for row in np.flatnonzero(refused)[:LISTED].tolist()]
     if bad:
-        raise BadData(_join_cell_messages(arrays.name, [sentence for _, _, sentence in sorted(bad)], count))
+        (row, _, meaning, raw), *others = sorted(bad, key=lambda cell: cell[:2])[:LISTED]
+        cell = column_texts(raw[row : row + 1])[0]
+        sentence = column_names.refused_cell_sentence(arrays.row(row), meaning, cell, layout)
+        also = f"; also {', '.join(f'row {k + 1}, {m.shown}' for k, _, m, _ in others)}" if others else ""
+        raise BadData(sentence + also + (f"; and {count - LISTED} more" if count > LISTED else ""))
     return {c: values for c, values in columns.items() if c != "held" or values.any()}, tuple(notes)
-
-
-def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
-    """One message from the messages on rejected cells, in row order, with each piece of advice once.
-
-    Args:
-        said: messages, at least the first `LISTED`.
-        count: number of rejected cells.
-    """
-    first, *others = said
-    more, repeats = list[str](), {first.partition(";")[2]}
-    for sentence in others[: LISTED - 1]:
-        cell_message, _, cure = sentence.removeprefix(f"{name} ").partition(";")
-        more.append(cell_message if cure in repeats else f"{cell_message};{cure}")
-        repeats.add(cure)
-    rest = f"; and {count - LISTED} more" if count > LISTED else ""
-    return f"{first}; also {'; '.join(more)}{rest}" if more else first
 
 
 def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], Names]:

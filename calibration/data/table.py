@@ -23,7 +23,7 @@ from calibration.data.columns import (
     WHEN,
     Layout,
 )
-from calibration.data.input_errors import BadData, allowed_words, rows_text
+from calibration.data.input_errors import BadData, allowed_words
 from calibration.data.named_arrays import Check, check_rows
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
@@ -236,20 +236,6 @@ class Runs:
         empty_column = np.full(len(self), np.nan)
         stacked = [self.columns.get(column, empty_column) for column in columns]
         return np.stack(stacked, 1) * np.asarray([c.factor for c in self.channels])
-
-    def missing(self) -> list[str]:
-        """A note on each channel with missing readings."""
-        notes = []
-        for channel, readings in zip(self.channels, self.measured().T, strict=True):
-            missing_rows = np.flatnonzero(np.isnan(readings))
-            if missing_rows.size == len(self):
-                notes.append(
-                    f"{channel.column}: no readings. Parameters that only this channel determines are not fitted"
-                )
-            elif missing_rows.size:
-                rows = rows_text(missing_rows.tolist(), 8)
-                notes.append(f"{channel.column}: {missing_rows.size} of {len(self)} readings are missing ({rows})")
-        return notes
 
     def configurations(self, robot: Robot) -> np.ndarray:
         """Index of each row's configuration in `robot`, shape (rows,).

@@ -183,7 +183,6 @@ def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> 
     _check_enough_readings(runs, names, noise)
     _check_motion(runs, noise)
     remarks = [
-        *runs.missing(),
         *_check_stuck_channels(runs),
         *observers.observer_kind(runs).check(runs, noise),
         *_constant_conditions(runs),

@@ -355,7 +355,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
         )
         for c in found.columns()
     ]  # fmt: skip
-    notes_of_data = [*found.unused(), *runs.missing()]
+    notes_of_data = found.unused()
     if len(seen.status) < len(runs):
         notes_of_data.insert(0, f"loop and calibrate use {len(seen.status)} of these rows (--rows)")
     has_clamped_rows = runs.has("held") or (
