@@ -382,7 +382,7 @@ REFUSED = {
     "no channels": (BENCH.replace('["total_current"]', "[]"), r"channels: got \[\]; expected a list of channels"),
     "unknown start": ('start = "still"' + BENCH, r"start: got still; allowed: rest, measured, free"),
     "unknown column": (BENCH + '[columns]\ntotal_curent_A = "I"', r"columns\.total_curent_A: no such column .*total_current_A"),
-    "odd column": (BENCH + "[columns]\ntotal_current_A = 3", r"columns\.total_current_A: got 3; expected total_current_A = \"LOGGER COLUMN\""),
+    "odd column": (BENCH + "[columns]\ntotal_current_A = 3", r"columns\.total_current_A\.column: got 3; expected total_current_A = \"LOGGER COLUMN\""),
     "factor 0": (
         BENCH + '[columns]\ntotal_current_A = {column = "I", factor = 0}',
         r"total_current_A\.factor: got 0; expected a number that is not 0",

@@ -283,16 +283,11 @@ def _check_time_order(runs: Runs) -> None:
         run_rows = np.flatnonzero(run == name)
         rows_of_falls = np.flatnonzero(np.diff(time[run_rows]) < 0)
         if 0 < rows_of_falls.size <= max(SELDOM * len(run_rows), 1):
-            raise time_goes_back(runs, *run_rows[rows_of_falls[0] :][:2])
-
-
-def time_goes_back(runs: Runs, before: int, row: int) -> BadData:
-    """Error of a run whose time falls from one row to the next, both counted from 0."""
-    time = runs["time_s"]
-    return BadData(
-        f"{runs.place(row)}, time_s: goes back from {time[before]:g} to {time[row]:g} s; give each "
-        "recording its own run_id, or sort the rows"
-    )
+            before, row = run_rows[rows_of_falls[0] :][:2]
+            raise BadData(
+                f"{runs.place(row)}, time_s: goes back from {time[before]:g} to {time[row]:g} s; give each recording "
+                "its own run_id, or sort the rows"
+            )
 
 
 def _median_of_neighbours(step: np.ndarray) -> np.ndarray:

@@ -38,6 +38,8 @@ KEYS, TEXTS = ("columns", "ask", "header"), {"note": "a sentence", "needs": COLU
 KEYS_OF_COLUMN = ("column", "factor", "per", "times", "sign_bit", "zero", *TEXTS)
 #: Keys of a number that the user gives for a preset.
 KEYS_OF_NUMBER = ("about", "usual")
+#: Numbers of a file that asks for none.
+NO_NUMBERS: Mapping[str, float] = {}
 #: Separator between the name of a preset and the user's numbers, as in `vesc,pole_pairs=7`.
 SEPARATOR = ","
 
@@ -211,15 +213,31 @@ def parse_preset(content: Json, where: str, given: Mapping[str, float]) -> Prese
         raise BadConfiguration(
             f'{where}, columns: got {columns!r}; expected a table of columns, such as time_s = "t"'
         )
-    layout = Layout(channels=channels.EVERY)
-    spellings, entries = layout.spellings(), []
-    for own_column, patterns in columns.items():
+    return Preset(where, parse_columns(columns, where, numbers=numbers), header)
+
+
+def parse_columns(
+    table: Json, where: str, keys: Sequence[str] = KEYS_OF_COLUMN, numbers: Mapping[str, float] = NO_NUMBERS
+) -> tuple[PresetColumn, ...]:
+    """Columns that a table `[columns]` of a preset or of a robot file states.
+
+    Args:
+        where: beginning of the error message.
+        keys: allowed keys of a column.
+        numbers: numbers that columns may refer to, by name.
+
+    Raises:
+        BadConfiguration: a key or a column is unknown, or a value is invalid.
+    """
+    layout, columns = Layout(channels=channels.EVERY), []
+    spellings = layout.spellings()
+    for own_column, patterns in table.items():
         place = f"{where}, columns.{own_column}"
         if own_column not in spellings:
             names_text = allowed_words(own_column, spellings, shown=layout.known())
             raise BadConfiguration(f"{place}: no such column of a table; {names_text}; other units are allowed too")
-        entries.append(_parse_column(own_column, patterns, place, numbers))
-    return Preset(where, tuple(entries), header)
+        columns.append(_parse_column(own_column, patterns, place, keys, numbers))
+    return tuple(columns)
 
 
 def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
@@ -248,11 +266,13 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
     return numbers
 
 
-def _parse_column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> PresetColumn:
+def _parse_column(
+    mine: str, theirs: Any, where: str, keys: Sequence[str], numbers: Mapping[str, float]
+) -> PresetColumn:
     form = f'{mine} = "LOGGER COLUMN", or {mine} = {{column = "LOGGER COLUMN", factor = 0.001}}'
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
-        stated_word(key, KEYS_OF_COLUMN, where, f"got the key {key}")
+        stated_word(key, keys, where, f"got the key {key}")
     column = table.get("column")
     names = stated_names([column] if isinstance(column, str) else column, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")

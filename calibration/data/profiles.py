@@ -301,7 +301,8 @@ def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]
     columns: dict[str, tuple[str, str]] = {}
     for column in header:
         if column not in fields:
-            _refuse_column(name, column)
+            names_text = allowed_words(column, fields, 3, _standard_columns())
+            raise BadData(f"{name}: unknown column {column or '(without a name)'}; {names_text}")
         field, unit = fields[column]
         first, _ = columns.setdefault(field, (column, unit))
         if header.count(column) > 1 or first != column:
@@ -315,19 +316,6 @@ def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]
 def _standard_columns() -> list[str]:
     """Column of each quantity, in its first unit."""
     return [next(iter(quantity.columns())) for quantity in QUANTITIES.values()] + [MODE, SURFACE]
-
-
-def _refuse_column(name: str, column: str) -> NoReturn:
-    # The longest matching name comes first: motor_speed before speed.
-    for quantity in sorted(QUANTITIES.values(), key=lambda q: -len(q.name)):
-        if column == quantity.name or column.startswith(f"{quantity.name}_"):
-            unit = column[len(quantity.name) + 1 :] or "none"
-            raise BadData(
-                f"{name}, column {column}: got the unit {unit}; expected one of {', '.join(quantity.columns())}"
-            )
-    raise BadData(
-        f"{name}: unknown column {column or '(without a name)'}; {allowed_words(column, _standard_columns(), 3)}"
-    )
 
 
 @dataclasses.dataclass(frozen=True)

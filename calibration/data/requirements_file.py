@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from itertools import product
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from calibration.data import Json
-from calibration.data.input_errors import BadConfiguration, allowed_words, stated_as, stated_number, stated_word
+from calibration.data.input_errors import BadConfiguration, stated_as, stated_number, stated_word
 from calibration.data.input_files import toml_content, toml_text
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model.paper_tables import BENCH, SURFACES
@@ -32,6 +31,8 @@ RANGES: dict[str, tuple[float, float, str]] = {
 }
 #: Keys of an envelope.
 KEYS = ("configuration", "surface", "battery", *RANGES)
+#: Message on an unknown name.
+NO_KEY = "no such key"
 #: Uses of the battery, for the endurance.
 DUTIES = ("standing", "driving")
 #: Smallest and largest limit of a requirement, in the unit of its name.
@@ -173,7 +174,7 @@ def parse_requirements(text: str, where: str) -> Requirements:
     envelope = _updated_envelope(Envelope(), table, place)
     requirements: list[Requirement] = []
     for name, value in content.items():
-        _check_name(name, (*QUANTITIES, "envelope"), where)
+        stated_word(name, (*QUANTITIES, "envelope"), f"{where}, {name}", NO_KEY)
         entries = value if isinstance(value, list) else [value]
         if not entries:
             raise BadConfiguration(
@@ -186,26 +187,6 @@ def parse_requirements(text: str, where: str) -> Requirements:
         raise BadConfiguration(f"{where}: contains no requirement; expected one of {', '.join(QUANTITIES)}")
     _check_consistent(requirements, envelope, where)
     return Requirements(where, envelope, tuple(requirements), text)
-
-
-def _check_name(name: str, known: Sequence[str], where: str) -> None:
-    """Rejects an unknown name, or one without its unit."""
-    if name in known:
-        return
-    stems = {_stem_of_name(k): k for k in known if _stem_of_name(k) != k}
-    head = max((s for s in stems if name.startswith(f"{s}_")), key=len, default="")
-    why = f"no such key; {allowed_words(name, known)}"
-    if name in stems:
-        why = f"no unit in its name; write {stems[name]}"
-    elif head:
-        why = f"unit {name[len(head) + 1 :]} is not supported; write {stems[head]}"
-    raise BadConfiguration(f"{where}, {name}: {why}")
-
-
-def _stem_of_name(name: str) -> str:
-    """Name without unit."""
-    units = ("_m_s", "_mm", "_deg", "_kg", "_min", "_C", "_Nm", "_rpm", "_A", "_Wh", "_V")
-    return next((name.removesuffix(u) for u in units if name.endswith(u)), name)
 
 
 def _parse_range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
@@ -223,7 +204,7 @@ def _updated_envelope(base: Envelope, stated: Json, where: str) -> Envelope:
     envelope: Json = {}
     for key, value in stated.items():
         key_path = f"{where}.{key}"
-        _check_name(key, KEYS, where)
+        stated_word(key, KEYS, f"{where}, {key}", NO_KEY)
         if key in RANGES:
             envelope[key] = _parse_range(value, key_path, *RANGES[key])
         elif key == "battery":
@@ -253,7 +234,7 @@ def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str
     for key in table:
         if key in ("duty", "share") and not is_endurance:
             raise BadConfiguration(f"{where}: duty and share can be used only with endurance_min")
-        _check_name(key, ("least", "most", "source", *KEYS, *own_keys), where)
+        stated_word(key, ("least", "most", "source", *KEYS, *own_keys), f"{where}, {key}", NO_KEY)
         if key in AXES and key not in quantity.axes:
             raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")
     limits = {sense: _parse_limit(table[sense], where, quantity) for sense in ("least", "most") if sense in table}

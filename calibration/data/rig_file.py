@@ -8,11 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from calibration.data import Json, Mapped, Names
-from calibration.data.columns import Layout
+from calibration.data import Json, Names, presets_file
 from calibration.data.input_errors import (
     BadConfiguration,
-    allowed_words,
     is_number,
     stated_as,
     stated_names,
@@ -205,6 +203,7 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
             f"{place}: {min(idle)} is imposed, so it cannot be a reading; remove it, or set imposed = "
             f'"{next(word for word in IMPOSED if word != imposed)}"'
         )
+    columns = stated_as(content.pop("columns", {}), dict, f"{where}, columns", "a table [columns]")
     surfaces = stated_as(content.pop("surfaces", {}), dict, f"{where}, surfaces", "a table [surfaces]")
     for name, other in surfaces.items():
         for load in (name, other):
@@ -213,7 +212,9 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
         imposed=imposed,
         channels=names,
         instruments=_parse_instruments(content.pop("instruments", {}), names, f"{where}, instruments"),
-        columns=_parse_columns(content.pop("columns", {}), f"{where}, columns"),
+        columns=tuple(
+            (c.mine, c.theirs[0], c.factor) for c in presets_file.parse_columns(columns, where, ("column", "factor"))
+        ),
         start=start,
         between_rows=between,
         surfaces=tuple(surfaces.items()),
@@ -247,27 +248,6 @@ def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[I
         step = None if quantum == FREE else float(quantum) * channel.factor
         instruments.append(Instrument(name, None if signed == FREE else signed, step))
     return tuple(instruments)
-
-
-def _parse_columns(stated: Any, where: str) -> Mapped:
-    layout, entries = Layout(channels=channels.EVERY), []
-    spellings = layout.spellings()
-    for own_column, entry in stated_as(stated, dict, where, "a table [columns]").items():
-        place = f"{where}.{own_column}"
-        if own_column not in spellings:
-            names_text = allowed_words(own_column, spellings, shown=layout.known())
-            raise BadConfiguration(f"{place}: no such column of a table; {names_text}; also in other units")
-        table = {"column": entry} if isinstance(entry, str) else entry
-        if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
-            raise BadConfiguration(
-                f'{place}: got {entry!r}; expected {own_column} = "LOGGER COLUMN", or '
-                f'{own_column} = {{column = "LOGGER COLUMN", factor = 0.001}}'
-            )
-        factor = table.get("factor", 1.0)
-        if not is_number(factor) or not math.isfinite(factor) or not factor:
-            raise BadConfiguration(f"{place}.factor: got {factor!r}; expected a number that is not 0")
-        entries.append((own_column, table["column"], float(factor)))
-    return tuple(entries)
 
 
 def required_parameters(rig: Rig, values: Mapping[str, Any]) -> Names:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +25,7 @@ from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
 from mmrjax.compile.compiling import in_double
 from mmrjax.effects.base import scaled_effect
-from mmrjax.errors import list_some, printable
+from mmrjax.errors import list_some, printable, similar_words
 from mmrjax.model import paper_robots, params, power
 from mmrjax.model.driver import DECAYS, Controller
 from mmrjax.model.quantities import GOALS
@@ -416,16 +415,12 @@ def _check_setting(where: str, name: str, value: Any) -> Any:
 
 def _parameter_choices(name: str, known: Collection[str]) -> str:
     """Parts and parameters to choose from, for the message about an unknown parameter."""
-    head = name.partition(".")[0]
-    heads = list(dict.fromkeys(n.partition(".")[0] for n in known))
-    near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
-    if head in heads:
-        return allowed_words(name, near or [n for n in known if n.startswith(f"{head}.")])
-    hint = f"did you mean {near[0]}? " if near and difflib.get_close_matches(head, heads, 1, 0.6) else ""
-    single = ("base", "sides", "configurations", *rig_file.KEYS)
-    if not name.count(".") and (close := difflib.get_close_matches(name, single, 1, 0.75)):
-        hint = f"did you mean {close[0]}? "
-    return f"{hint}the robot has {', '.join(heads)}; a file may also contain {', '.join(single)}"
+    head, parts = name.partition(".")[0], dict.fromkeys(n.partition(".")[0] for n in known)
+    if head in parts:
+        return allowed_words(name, [n for n in known if n.startswith(f"{head}.")])
+    keys = ("base", "sides", "configurations", *rig_file.KEYS)
+    hint = "".join(f"did you mean {word}? " for word in similar_words(name, (*known, *keys)))
+    return f"{hint}the robot has {', '.join(parts)}; a file may also contain {', '.join(keys)}"
 
 
 def _check_pairs(robot: Robot, where: str) -> None:

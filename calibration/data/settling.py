@@ -14,7 +14,7 @@ import numpy as np
 from calibration.data import Columns
 from calibration.data.clock import applied_drive, differs_from_row_before
 from calibration.data.columns import LOAD, SPEED
-from calibration.data.contradictions import GAP, time_goes_back
+from calibration.data.contradictions import GAP
 from calibration.data.inferred_facts import common_step
 from calibration.data.input_errors import BadData
 from calibration.data.row_checks import inertia_at_motor
@@ -264,7 +264,7 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
         raise BadData(
             f"{runs.source}: column time_s is missing, so each row is already a settled run; use it with loop"
         )
-    rows_by_run = _in_order(runs)
+    rows_by_run = _rows_by_run(runs)
     step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in rows_by_run])))
     shortest = max(LEAST, 20 * step) if shortest is None else shortest
     drives = applied_drive(runs)
@@ -294,24 +294,18 @@ def settled_channels(robot: Robot) -> tuple[Channel, ...]:
     return tuple(c for c in channels.EVERY if (c in robot.channels and c.settled) or c.name in rates)
 
 
-def _in_order(runs: Runs) -> list[np.ndarray]:
-    """Rows of each run, checked for increasing time."""
-    run, time = runs.run_names, runs["time_s"]
-    rows_by_run = [np.flatnonzero(run == name) for name in dict.fromkeys(run.tolist())]
+def _rows_by_run(runs: Runs) -> list[np.ndarray]:
+    """Rows of each run, in order of time, which must not be repeated."""
+    rows_by_run, time = list(runs.rows_by_run().values()), runs["time_s"]
     for rows in rows_by_run:
-        steps = np.diff(time[rows])
-        if (steps <= 0).any():
-            k = int(np.argmax(steps <= 0))
-            if steps[k] < 0:
-                raise time_goes_back(runs, *rows[k : k + 2])
+        for k in np.flatnonzero(np.diff(time[rows]) == 0)[:1].tolist():
             raise BadData(
-                f"{runs.place(rows[k + 1])}, time_s: {time[rows[k]]:g} s is repeated; give each sample its "
-                "own time, or remove one of them"
+                f"{runs.place(rows[k + 1])}, time_s: {time[rows[k]]:g} s is repeated; give each sample its own time, "
+                "or remove one of them"
             )
-    if max(map(len, rows_by_run)) < FEWEST:
+    if (longest := max(map(len, rows_by_run))) < FEWEST:
         raise BadData(
-            f"{runs.source}: {count_noun(max(map(len, rows_by_run)), 'sample')} in its longest run; at least "
-            f"{FEWEST} are needed"
+            f"{runs.source}: {count_noun(longest, 'sample')} in its longest run; at least {FEWEST} are needed"
         )
     return rows_by_run
 
