@@ -18,7 +18,14 @@ from jaxtyping import Array
 
 from calibration.data import Columns, Json, Names, delimited, input_files
 from calibration.data.columns import LOAD, SUPPLY
-from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, is_number
+from calibration.data.input_errors import (
+    BadConfiguration,
+    BadData,
+    allowed_words,
+    stated_count,
+    stated_number,
+    stated_word,
+)
 from calibration.data.named_arrays import column_texts
 from calibration.data.sources import opening, reading
 from mmrjax.missions.mission import Start
@@ -151,15 +158,13 @@ class ProfileTable:
         Raises:
             BadConfiguration: the profile states a voltage, but the battery feeds the motors.
         """
-        if battery and PAIRS[1][0] in self.values:
-            raise BadConfiguration(
-                f"--battery cannot be combined with {self.source}, which gives voltage_left_V; give duty_left "
-                "and duty_right instead"
-            )
-        if battery and "voltage" in self.values:
-            raise BadConfiguration(
-                f"--battery cannot be combined with {self.source}, which gives supply_voltage_V; use one of the two"
-            )
+        instead = {
+            "voltage_left": "voltage_left_V; give duty_left and duty_right instead",
+            "voltage": "supply_voltage_V; use one of the two",
+        }
+        for field, cure in instead.items():
+            if battery and field in self.values:
+                raise BadConfiguration(f"--battery cannot be combined with {self.source}, which gives {cure}")
 
     def profile(self, robot: Robot, conditions: Conditions) -> Profile:
         """Profile in the form that simulations use, for a batch of runs.
@@ -269,24 +274,21 @@ def _header_settings(name: str, comments: list[str]) -> Json:
         except (ValueError, RecursionError) as error:
             raise BadData(f"{name}: got the line # {text}; expected TOML such as # cycles = 40 ({error})") from error
         for key, value in settings.items():
-            if key not in SETTINGS:
-                raise BadData(f"{name}: got the setting {key}; {allowed_words(key, SETTINGS)}")
             if key in header_settings:
                 raise BadData(f"{name}: {key} is set twice; expected once")
             header_settings[key] = value
-    cycles, between = header_settings.get("cycles", 1), header_settings.get("between_rows", BETWEEN[0])
-    if isinstance(cycles, bool) or not isinstance(cycles, int) or cycles < 1:
-        raise BadData(f"{name}, cycles: got {cycles!r}; expected a whole number from 1")
-    if between not in BETWEEN:
-        raise BadData(f"{name}, between_rows: got {between!r}; expected held or linear")
-    begins = {}
-    for key, (field, least, greatest, unit_size) in STARTS.items():
-        if key not in header_settings:
-            continue
-        value = header_settings[key]
-        if not is_number(value) or not least <= value <= greatest:
-            raise BadData(f"{name}, {key}: got {value!r}; expected a number, {least:g} to {greatest:g}")
-        begins[field] = unit_size * value
+    try:
+        for key in header_settings:
+            stated_word(key, SETTINGS, name, f"got the setting {key}")
+        begins = {
+            field: unit_size * stated_number(header_settings[key], f"{name}, {key}", low, high)
+            for key, (field, low, high, unit_size) in STARTS.items()
+            if key in header_settings
+        }
+        cycles = stated_count(header_settings.get("cycles", 1), f"{name}, cycles", 1, LONGEST)
+        between = stated_word(header_settings.get("between_rows", BETWEEN[0]), BETWEEN, f"{name}, between_rows")
+    except BadConfiguration as error:  # of a file of data
+        raise BadData(str(error)) from error
     return {"cycles": cycles, "linear": between == "linear", "begins": begins}
 
 
