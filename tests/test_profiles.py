@@ -157,7 +157,7 @@ WRONG = {
     "speed out of range in its unit": ("time_s,speed_km_h\n0,40\n5,1\n", r"row 1, speed_km_h: got 40; expected -36 to 36"),
     "slope too steep": ("time_s,slope_percent\n0,120\n5,1\n", r"row 1, slope_percent: got 120; expected -100 to 100"),
     "unknown column": ("time_s,dutty\n0,1\n5,1\n", r"mission.csv: unknown column dutty; .*duty"),
-    "column without a name": ("time_s,,duty\n0,1,1\n5,1,1\n", r"unknown column \(without a name\)"),
+    "column without a name": ("time_s,,duty\n0,1,1\n5,1,1\n", r"unknown column column 2"),
     "unknown unit": ("time_s,speed_kmh\n0,1\n5,1\n", r"unknown column speed_kmh; did you mean speed_km_h, "),
     "no unit": ("time,duty\n0,1\n5,1\n", r"unknown column time; did you mean time_s, time_ms, time_us\? allowed: time_s, "),
     "unit of another quantity": ("time_s,motor_speed_mm_s\n0,1\n5,1\n", r"unknown column motor_speed_mm_s; did you mean .*motor_speed_r"),

@@ -56,11 +56,11 @@ FILES = {
     ),
     "another key": (
         'colour = "red"\n' + BRAKE,
-        r"colour: no such parameter; .*the robot has .*; a file may also contain base, ",
+        r"colour: no such parameter; .*allowed: .*base, ",
     ),
     "a key of the rig misspelt": (
         BRAKE.replace("imposed", "impose"),
-        r"impose: no such parameter; did you mean imposed\? the robot has",
+        r"impose: no such parameter; did you mean imposed\? allowed: ",
     ),
 }
 

@@ -107,7 +107,10 @@ REFUSED = {
     "effect stands as a number": ("[effects]\nchurning = 3", r"effects\.churning: no such parameter"),
     "unknown base": ("base = 'best'", r"base: got best; allowed: nominal, sm1, sm2"),
     "other schema": ("schema = 'x/9'", r"schema: got x/9; expected mmrjax\.robot/2"),
-    "unknown configuration": ("[8T]\nmass = 2", r"8T\.mass: no such parameter; did you mean 6T2A\.mass\? the robot has .*gearbox, 6T2A, 4W2T"),
+    "unknown configuration": (
+        "[8T]\nmass = 2",
+        r"8T\.mass: no such parameter; did you mean 6T2A\.mass\? allowed: .*gearbox, 6T2A, 4W2T",
+    ),
     "no configurations": ("configurations = []", r"configurations: got \[\]; expected a list of at least one name"),
     "configurations as a word": (
         "configurations = 'rover'",
@@ -160,7 +163,7 @@ REFUSED = {
     "cells as a word": ("[battery]\ncells = 'x'", r"battery\.cells: got 'x'; expected a whole number, 1 to 100"),
     "a configuration that is not there": (
         "configurations = ['4W2T']\n[tracked]\nmass = 12",
-        r"tracked\.mass: no such parameter; the robot has battery, motor, gearbox, 4W2T",
+        r"tracked\.mass: no such parameter; allowed: battery, motor, gearbox, 4W2T",
     ),
     "a switch as a number": (
         "[gearbox]\nmesh_theory = 1",

@@ -609,16 +609,6 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
             settled(tmp_path, robot)
 
 
-@pytest.mark.parametrize("levels, said", [
-    ((12.0,) * 3, r"^log\.csv rows 1 to 600, supply_voltage_V: 12 V in every row\. .* Log three or more"),
-    ((6.0, 12.0), ""),
-])  # fmt: skip
-def test_a_log_of_one_level_is_said_with_what_it_lacks(tmp_path, levels, said):
-    robot = bench(tmp_path, stairs(levels))
-    (found,) = rig_facts.log_doubts(records.read_runs(tmp_path / "log.csv", robot=robot), robot) or ("",)
-    assert re.search(said, found) and bool(found) == bool(said)
-
-
 @pytest.mark.parametrize("limit, ammeter", [
     (12.0, "total_current"), (12.0, "motor_current"), (100.0, "total_current"),
 ])  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
+import itertools
 import math
 import re
 import tomllib
@@ -16,15 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data import Columns, Json, Names, delimited, input_files
-from calibration.data.columns import LOAD, SUPPLY
+from calibration.data import Columns, Json, Names, column_names, delimited, input_errors, input_files
+from calibration.data.columns import LOAD, SUPPLY, Column
 from calibration.data.input_errors import (
     BadConfiguration,
     BadData,
     allowed_words,
-    stated_count,
-    stated_number,
-    stated_word,
 )
 from calibration.data.named_arrays import column_texts
 from calibration.data.sources import opening, reading
@@ -42,10 +39,8 @@ from mmrjax.missions.profile import (
     sides_error,
 )
 from mmrjax.model import channels, quantities
-from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import SURFACES, adhesion_ratio, lateral_ratio
-from mmrjax.model.quantities import Quantity
 from mmrjax.model.robot import Robot
 
 #: Profiles that come with the package, in `calibration/data/profiles/`.
@@ -55,12 +50,13 @@ CONTROLLED = tuple(mode for mode in MODES if mode in channels.USUAL)
 BETWEEN = ("held", "linear")
 #: Largest number of rows, counting all cycles.
 LONGEST = 1_000_000
+MODE, SURFACE = "mode", "surface"
 #: Quantities of columns, by field of `mmrjax.missions.profile.Profile`. Demands are stored in `demand`.
-QUANTITIES: dict[str, Quantity] = {
+QUANTITIES: dict[str, quantities.Quantity] = {
     quantity.key: quantity
     for quantity in (quantities.BY_COLUMN["time_s"], *quantities.SET, *channels.EVERY)
     if quantity.in_profiles
-}
+} | {label.key: label for label in quantities.LABELS if label.key in (MODE, SURFACE)}
 #: Columns of demands and their modes. A row has at most one demand.
 DEMANDS = {
     **dict.fromkeys(("duty", *PAIRS[0], *PAIRS[1]), MODES[VOLTAGE]),
@@ -68,7 +64,6 @@ DEMANDS = {
 }
 #: Columns that must not be empty in any row.
 HELD = ("voltage", "slope_deg", "payload", "load_torque", "current_other")
-MODE, SURFACE = "mode", "surface"
 #: Initial values of a mission that comment lines may set: field of `Start`, least, greatest, and SI value of the
 #: unit.
 STARTS = {
@@ -208,37 +203,29 @@ def read_profile(source: str | Path) -> ProfileTable:
             file, row (counted from 1 below the header), column, value and allowed values.
     """
     if str(source) in PACKAGED:
-        file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
-        return _profile_of_text(file.read_bytes(), str(source))
+        with resources.as_file(resources.files("calibration") / "data" / "profiles" / f"{source}.csv") as path:
+            return _profile_of_file(path, "", str(source))
     path, signal_path = opening.split_source(str(source))
     if not path.exists():
         raise BadData(f"{source}: no such file and no packaged profile; {allowed_words(str(source), PACKAGED)}")
-    if opening.format_of(path, path.name) is None:
-        return _profile_of_text(input_files.csv_bytes(path, path.name or str(source)), path.name)
-    table = reading.read_whole_table(path, signal_path)
-    rows = [list(table.header), *map(list, zip(*map(column_texts, table.values), strict=True))]
-    return _parsed(table.name, _header_settings(table.name, []), rows, table.digest, table.notes)
+    return _profile_of_file(path, signal_path, path.name or str(source))
 
 
-def _profile_of_text(content: bytes, name: str) -> ProfileTable:
-    text, encoded = delimited.decode_text(name, content)
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    header_row = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    settings = _header_settings(name, lines[:header_row])
-    rows, notes = delimited.split_cells(name, lines[header_row:])
-    return _parsed(name, settings, rows, hashlib.sha256(content).hexdigest(), (*encoded, *notes))
-
-
-def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes: Names) -> ProfileTable:
-    if not rows:
+def _profile_of_file(path: Path, signal_path: str, name: str) -> ProfileTable:
+    comments: list[str] = []
+    if opening.format_of(path, name) is None:
+        text, _ = delimited.decode_text(name, input_files.csv_bytes(path, name))
+        lines = filter(None, map(str.strip, text.splitlines()))
+        comments = list(itertools.takewhile(lambda line: line.startswith("#"), lines))
+    settings, table = _header_settings(name, comments), reading.read_whole_table(path, signal_path)
+    if not table.header:
         raise BadData(f"{name}: the file is empty; expected a header that includes time_s, followed by data rows")
-    header, body = rows[0], rows[1:]
-    columns = _profile_columns(name, header)
-    if len(body) < 2:
-        row_text = "one row" if body else "a header and no rows"
+    columns = _profile_columns(name, table.header)
+    column_names.check_units(table, list(columns.values()))
+    if len(table) < 2:
+        row_text = "one row" if len(table) else "a header and no rows"
         raise BadData(f"{name}: got {row_text}; expected at least two rows, the last of which ends the mission")
-    delimited.check_row_lengths(name, header, body)
-    texts = {field: [row[header.index(column)] for row in body] for field, (column, _) in columns.items()}
+    texts = {field: column_texts(raw) for field, raw in zip(columns, table.values, strict=True)}
     for field in (*HELD, SURFACE):
         if field in texts and not settings["linear"]:  # no segment follows the last row
             texts[field][-1] = texts[field][-1] or texts[field][-2]
@@ -257,7 +244,9 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
         if label not in SURFACES:
             cells.refuse(SURFACE, row, f"one of these; {allowed_words(label, SURFACES)}")
     surfaces = tuple(texts[SURFACE]) if SURFACE in texts else None
-    return ProfileTable(name, time, modes, demand, values, surfaces, digest=digest, notes=notes, **settings)
+    return ProfileTable(
+        name, time, modes, demand, values, surfaces, digest=table.digest, notes=table.notes, **settings
+    )
 
 
 def _header_settings(name: str, comments: list[str]) -> Json:
@@ -279,45 +268,45 @@ def _header_settings(name: str, comments: list[str]) -> Json:
             header_settings[key] = value
     try:
         for key in header_settings:
-            stated_word(key, SETTINGS, name, f"got the setting {key}")
+            input_errors.stated_word(key, SETTINGS, name, f"got the setting {key}")
         begins = {
-            field: unit_size * stated_number(header_settings[key], f"{name}, {key}", low, high)
+            field: unit_size * input_errors.stated_number(header_settings[key], f"{name}, {key}", low, high)
             for key, (field, low, high, unit_size) in STARTS.items()
             if key in header_settings
         }
-        cycles = stated_count(header_settings.get("cycles", 1), f"{name}, cycles", 1, LONGEST)
-        between = stated_word(header_settings.get("between_rows", BETWEEN[0]), BETWEEN, f"{name}, between_rows")
+        cycles = input_errors.stated_count(header_settings.get("cycles", 1), f"{name}, cycles", 1, LONGEST)
+        between = input_errors.stated_word(
+            header_settings.get("between_rows", BETWEEN[0]), BETWEEN, f"{name}, between_rows"
+        )
     except BadConfiguration as error:  # of a file of data
         raise BadData(str(error)) from error
     return {"cycles": cycles, "linear": between == "linear", "begins": begins}
 
 
-def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
-    """Column and unit of each field in the file.
+def _profile_columns(name: str, header: Names) -> dict[str, Column]:
+    """Column of each field in the file.
 
     Raises:
         BadData: a column or unit is unknown, a field occurs twice, or time is missing.
     """
-    fields = {column: (key, unit) for key, q in QUANTITIES.items() for column, unit in q.columns().items()}
-    fields |= {column: (column, "") for column in (MODE, SURFACE)}
-    columns: dict[str, tuple[str, str]] = {}
+    fields = {
+        column: (field, Column(quantity, column, unit))
+        for field, quantity in QUANTITIES.items()
+        for column, unit in quantity.columns().items()
+    }
+    usual = [next(iter(quantity.columns())) for quantity in QUANTITIES.values()]
+    columns: dict[str, Column] = {}
     for column in header:
         if column not in fields:
-            names_text = allowed_words(column, fields, 3, _standard_columns())
-            raise BadData(f"{name}: unknown column {column or '(without a name)'}; {names_text}")
-        field, unit = fields[column]
-        first, _ = columns.setdefault(field, (column, unit))
+            raise BadData(f"{name}: unknown column {column}; {allowed_words(column, fields, 3, usual)}")
+        field, meaning = fields[column]
+        first = columns.setdefault(field, meaning).shown
         if header.count(column) > 1 or first != column:
             column_words = f"column {column} twice" if column == first else f"columns {first} and {column}"
             raise BadData(f"{name}: got {column_words}; expected one of them")
     if "time" not in columns:
-        raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(_standard_columns())}")
+        raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(usual)}")
     return columns
-
-
-def _standard_columns() -> list[str]:
-    """Column of each quantity, in its first unit."""
-    return [next(iter(quantity.columns())) for quantity in QUANTITIES.values()] + [MODE, SURFACE]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -325,13 +314,13 @@ class _CellReader:
     """Cells of a file by field, and the column and unit of each field."""
 
     source: str
-    columns: dict[str, tuple[str, str]]
+    columns: dict[str, Column]
     texts: dict[str, list[str]]
     linear: bool
 
     def called(self, field: str) -> str:
         """Column of a field in the file, or else its usual column."""
-        return self.columns[field][0] if field in self.columns else next(iter(QUANTITIES[field].columns()))
+        return self.columns[field].shown if field in self.columns else next(iter(QUANTITIES[field].columns()))
 
     def text(self, field: str, row: int) -> str:
         """The cell of a field, empty if the file has no such column."""
@@ -339,12 +328,14 @@ class _CellReader:
 
     def refuse(self, field: str, row: int, allowed: str) -> NoReturn:
         cell_text = self.text(field, row) or "an empty cell"
-        raise BadData(f"{self.source} row {row + 1}, {self.columns[field][0]}: got {cell_text}; expected {allowed}")
+        raise BadData(
+            f"{self.source} row {row + 1}, {self.columns[field].shown}: got {cell_text}; expected {allowed}"
+        )
 
     def value(self, field: str, row: int) -> float:
         """Number in a cell, in the unit that `Profile` uses."""
-        quantity, unit = QUANTITIES[field], self.columns[field][1]
-        low, high = quantity.limits(unit)
+        meaning = self.columns[field]
+        low, high = meaning.limits()
         allowed = f"{low:g} to {high:g}"
         try:
             number = float(self.text(field, row))
@@ -352,8 +343,9 @@ class _CellReader:
             self.refuse(field, row, f"a number, {allowed}")
         if not math.isfinite(number) or not low <= number <= high:
             self.refuse(field, row, allowed)
-        value = quantity.value(number, unit)
-        return value * quantity.factor if isinstance(quantity, Channel) else value
+        return meaning.value(number) * (
+            meaning.quantity.factor if isinstance(meaning.quantity, channels.Channel) else 1.0
+        )
 
     def values(self, field: str) -> np.ndarray:
         """Numbers of a required column."""
@@ -401,7 +393,7 @@ def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -
     mode = cells.text(MODE, row)
     if mode and mode not in MODES:
         cells.refuse(MODE, row, f"one of these; {allowed_words(mode, MODES)}")
-    columns = [cells.columns[field][0] for field in DEMANDS if field in cells.columns]
+    columns = [cells.columns[field].shown for field in DEMANDS if field in cells.columns]
     mode = mode or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
     if not mode and row == len(cells.texts["time"]) - 1:
         mode = before
@@ -423,9 +415,9 @@ def _check_demands(
     """
     place = f"{cells.source} row {row + 1}"
     if others:
-        other = cells.columns[demands[0]][0] if demands and not cells.text(MODE, row) else f"mode {mode}"
+        other = cells.columns[demands[0]].shown if demands and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
-            f"{place}, {cells.columns[others[0]][0]}: got {cells.text(others[0], row)} in addition to {other}; "
+            f"{place}, {cells.columns[others[0]].shown}: got {cells.text(others[0], row)} in addition to {other}; "
             "expected one demand per row"
         )
     for field in next((pair for pair in PAIRS if pair[0] in cells.columns), ()):

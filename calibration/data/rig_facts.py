@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.data import Names, rig_file
-from calibration.data.clock import applied_drive, changing_columns, intervals_by_run
+from calibration.data.clock import applied_drive, intervals_by_run
 from calibration.data.columns import CURRENT, LOAD, SPEED
 from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
@@ -274,20 +274,6 @@ def jitter_sentence(runs: Runs) -> str:
     return ""
 
 
-def constant_conditions_sentence(runs: Runs) -> str:
-    """Sentence on a log in which no condition changes, empty for others."""
-    conditions, column = (*changing_columns(runs), *runs.layout.sides), runs.layout.imposed_column
-    if not (runs.sampled and runs.has(column) and np.isfinite(runs[column]).all()):
-        return ""
-    if any(len(np.unique(runs[c])) > 1 for c in conditions if runs.has(c)):
-        return ""
-    return (
-        f"{runs.place(0, len(runs) - 1)}, {runs.heading(column)}: {three_digits(runs[column][0])} "
-        f"{column.rpartition('_')[2]} in every row. One level does not separate losses by current from those by "
-        "speed. Log three or more, in both directions if the drive reverses"
-    )
-
-
 #: Rows up to this share of the largest voltage give resistance and back-EMF. Fewest such rows. Their largest relative
 #: misfit. Smallest share of a larger voltage that its rows must show.
 INNER, ROWS_INNER, FITS, REACHES = 0.25, 30, 0.2, 0.8
@@ -390,7 +376,7 @@ def swapped_sentence(runs: Runs) -> str:
 
 def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Doubts about a log, one sentence each: times, levels, limits, and units that do not fit the robot."""
-    of_runs = (jitter_sentence, saturation_sentence, constant_conditions_sentence, swapped_sentence)
+    of_runs = (jitter_sentence, saturation_sentence, swapped_sentence)
     of_robot = (doubtful_time, doubtful_current, doubtful_torque)
     doubts = (*(doubt(runs) for doubt in of_runs), *(doubt(runs, robot) for doubt in of_robot))
     return tuple(filter(None, doubts))

@@ -341,9 +341,3 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
             size = FREE if instrument.quantum is None else instrument.quantum / channel.factor
             lines.append(f"quantum = {toml_value(size)}  # [{channel.unit}] step of its readings")
     return head, tables
-
-
-def is_default_rig(rig: Rig) -> bool:
-    """True if a rig is driven and measured like a robot whose file states no rig."""
-    usual = Rig()
-    return all(getattr(rig, key) == getattr(usual, key) for key in KEYS)

@@ -25,7 +25,7 @@ from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
 from mmrjax.compile.compiling import in_double
 from mmrjax.effects.base import scaled_effect
-from mmrjax.errors import list_some, printable, similar_words
+from mmrjax.errors import list_some, printable
 from mmrjax.model import paper_robots, params, power
 from mmrjax.model.driver import DECAYS, Controller
 from mmrjax.model.quantities import GOALS
@@ -419,8 +419,7 @@ def _parameter_choices(name: str, known: Collection[str]) -> str:
     if head in parts:
         return allowed_words(name, [n for n in known if n.startswith(f"{head}.")])
     keys = ("base", "sides", "configurations", *rig_file.KEYS)
-    hint = "".join(f"did you mean {word}? " for word in similar_words(name, (*known, *keys)))
-    return f"{hint}the robot has {', '.join(parts)}; a file may also contain {', '.join(keys)}"
+    return allowed_words(name, (*known, *keys), shown=(*parts, *keys))
 
 
 def _check_pairs(robot: Robot, where: str) -> None:
@@ -461,7 +460,11 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
     if inherits or robot.battery.cells != base_robot.battery.cells:
         tables["battery"].append(f"cells = {robot.battery.cells}  # in series")
     head, rig_tables = rig_file.rig_lines(robot.rig)
-    if rig_file.is_default_rig(robot.rig) and inherits and robot.has_ground:
+    if (
+        inherits
+        and robot.has_ground
+        and all(getattr(robot.rig, key) == getattr(base_robot.rig, key) for key in rig_file.KEYS)
+    ):
         head, rig_tables = [], {}
     for name, load in robot.configurations.items():
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibration.data import Columns, Names
+from calibration.data import Columns, Names, named_arrays
 from calibration.data.columns import (
     CIRCUITS,
     CONDITIONS,
@@ -24,7 +24,6 @@ from calibration.data.columns import (
     Layout,
 )
 from calibration.data.input_errors import BadData, allowed_words
-from calibration.data.named_arrays import Check, check_rows
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -90,9 +89,9 @@ class Runs:
         """Table with further or other columns, and further notes."""
         return replace(self, columns={**self.columns, **columns}, notes=(*self.notes, *notes))
 
-    def check_rows(self, checks: Iterable[Check]) -> None:
+    def check_rows(self, checks: Iterable[named_arrays.Check]) -> None:
         """Runs checks of its rows, see `named_arrays.check_rows`."""
-        check_rows(self.source, self.columns, checks)
+        named_arrays.check_rows(self.source, self.columns, checks)
 
     def without_columns(self, names: Collection[str]) -> Runs:
         """Table without these columns."""
