@@ -55,7 +55,7 @@ FILES = {
     ),
     "no units": ("x,z\n0,0\n1,0\n", r"got columns x, z; expected x_m and z_m, or x_mm and z_mm"),
     "folds back": ("x_m,z_m\n0,0\n0.3,0.1\n0.2,0.2\n", r"x falls from 0\.3 to 0\.2 m at point 3"),
-    "a word": ("x_m,z_m\n0,0\n1,high\n", r"row 3, z_m: got 'high'; expected a number"),
+    "a word": ("x_m,z_m\n0,0\n1,high\n", r"row 2, z_m: got 'high'; expected a number"),
     "a point": ("x_m,z_m\n0,0\n", r"two points or more"),
 }
 
@@ -70,9 +70,9 @@ def test_terrains_that_are_none_are_refused_in_one_sentence(tmp_path, case):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("time_s,front_deg,rear_deg\n1,0,0\n1,0,0\n", r"row 3, time_s: got 1 after 1; expected increasing values"),
-        ("time_s,front_deg,rear_deg\n1,0,270\n", r"row 2, rear_deg: got 270 deg; expected -180 to 180"),
-        ("time_s,front_V,rear_V\n1,0,2400\n", r"row 2, rear_V: got 2400 V; expected -1000 to 1000 V"),
+        ("time_s,front_deg,rear_deg\n1,0,0\n1,0,0\n", r"row 2, time_s: got 1 after 1; expected increasing values"),
+        ("time_s,front_deg,rear_deg\n1,0,270\n", r"row 1, rear_deg: got 270 deg; expected -180 to 180"),
+        ("time_s,front_V,rear_V\n1,0,2400\n", r"row 1, rear_V: got 2400 V; expected -1000 to 1000 V"),
         ("front_deg,rear_deg\n1,0\n", r"expected x_mm and front_deg and rear_deg, or time_s"),
     ],
 )

@@ -106,13 +106,12 @@ def missing_readings(raw: Raw, rows: np.ndarray) -> np.ndarray:
     return np.array([raw[row].lower() in MISSING for row in rows.tolist()], bool)
 
 
-def check_rows(name: str, columns: Mapping[str, np.ndarray], checks: Iterable[Check], first: int = 1) -> None:
+def check_rows(name: str, columns: Mapping[str, np.ndarray], checks: Iterable[Check]) -> None:
     """Runs checks in their order, and rejects a table at the first wrong row of the first check that finds one.
 
     Args:
         name: name of the source, with which the message begins.
         columns: values of the columns, shape (rows,).
-        first: number of the first row.
     """
     for column, wrong, why in checks:
         for row in np.flatnonzero(wrong)[:1].tolist():
@@ -121,4 +120,4 @@ def check_rows(name: str, columns: Mapping[str, np.ndarray], checks: Iterable[Ch
                 "an empty cell" if np.isnan(value) else f"{value:g}",
                 why if isinstance(why, str) else why(row),
             )
-            raise BadData(f"{name} row {row + first}, {column}: got {cell}{end}")
+            raise BadData(f"{name} row {row + 1}, {column}: got {cell}{end}")

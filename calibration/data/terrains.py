@@ -71,7 +71,7 @@ def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Col
         columns[name] = named_arrays.column_numbers(raw)
         for row in np.flatnonzero(~np.isfinite(columns[name]))[:1].tolist():
             cell = named_arrays.column_texts(raw)[row]
-            raise BadData(f"{path.name} row {row + 2}, {name}: got {cell!r}; expected a number")
+            raise BadData(f"{path.name} row {row + 1}, {name}: got {cell!r}; expected a number")
     return columns, names
 
 
@@ -125,13 +125,13 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Leve
     if has_volts:
         allowed = f" V; expected -{HIGHEST:g} to {HIGHEST:g} V"
         checks += [(name, np.abs(columns[name]) > HIGHEST, allowed) for name in both]
-    check_rows(path.name, columns, checks, 2)
+    check_rows(path.name, columns, checks)
     x = jnp.asarray(knots if over_time else 1e-3 * knots)
     if has_volts:
         front, rear = (jnp.asarray(columns[name]) for name in both)
         return LeverSequence(x, front, rear, jnp.asarray(begins), over_time)
     for name in both:
-        for k, value in enumerate(columns[name], 2):
+        for k, value in enumerate(columns[name], 1):
             if why := lever_angle_refusal(robot, value):
                 raise BadData(f"{path.name} row {k}, {name}: {why}")
     front, rear = (jnp.asarray(np.radians(columns[name])) for name in both)
