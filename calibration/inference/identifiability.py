@@ -14,7 +14,6 @@ from calibration.data import Names
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
 from calibration.inference import optimizers
 from calibration.inference.fit_notes import DependentPair
-from calibration.inference.optimizers import Pin
 from calibration.inference.priors import SOFTNESS, Coordinates
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import compiled
@@ -176,11 +175,6 @@ class ProfileLikelihoods:
     better: float
 
 
-@compiled
-def _profiles(problem: Problem, starts: Array, pins: Pin) -> optimizers.Optimum:
-    return jax.vmap(lambda z, pin: optimizers.levenberg_marquardt(problem, z, pin)[0])(starts, pins)
-
-
 def profile_likelihoods(problem: Problem, z: Array, cost: float, about: Identifiability) -> ProfileLikelihoods:
     """Profile likelihoods of all parameters. All points of all profiles are refitted in one batch.
 
@@ -192,10 +186,12 @@ def profile_likelihoods(problem: Problem, z: Array, cost: float, about: Identifi
     pinned = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
     direction_of = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
     starts = centre + direction_of[:, None, :] * (pinned - centre[:, None])[..., None]
-    pinned_names = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
-    pins = Pin(jnp.asarray(pinned_names.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
-    profiles = _profiles(problem, pins.at, pins)
-    rise = 2 * (np.asarray(profiles.cost).reshape(pinned.shape) - cost)
+    held = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
+    refits = optimizers.fit_with_held(
+        problem, jnp.asarray(starts.reshape(-1, size)), jnp.asarray(held.reshape(-1, size))
+    )
+    cost_of_held = 0.5 * (pinned - np.asarray(problem.data.centre)[:, None]) ** 2
+    rise = 2 * (np.asarray(refits.cost).reshape(pinned.shape) + cost_of_held - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
     middle = len(PROFILE_STEPS)
     at_all = np.insert(pinned, middle, centre, axis=1)

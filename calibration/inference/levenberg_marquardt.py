@@ -9,7 +9,6 @@ edge in steps of 1e-4.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -41,9 +40,14 @@ def zero_inactive_residuals(r: Array, jacobian: Array, one_sided: slice) -> tupl
     return jnp.where(counts, r, 0.0), jnp.where(counts[:, None], jacobian, 0.0)
 
 
+def active_residuals(r: Array, one_sided: slice) -> Float[Array, " residuals"]:
+    """Residuals, with zeros for one-sided ones that are not positive."""
+    return r.at[one_sided].set(jnp.maximum(r[one_sided], 0.0))
+
+
 def half_squares(r: Array, one_sided: slice) -> Float[Array, ""]:
     """Objective: half the sum of squares of the residuals that count."""
-    return 0.5 * jnp.sum(r.at[one_sided].set(jnp.maximum(r[one_sided], 0.0)) ** 2)
+    return 0.5 * jnp.sum(active_residuals(r, one_sided) ** 2)
 
 
 def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array | float) -> Z:
@@ -81,39 +85,6 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
     return jax.lax.while_loop(has_changed, iterate, start)[3]
 
 
-class SolverLinearisation(eqx.Module):
-    """Residuals (one-sided ones with their signs) and their Jacobian at a point of the search.
-
-    Attributes:
-        first, last: the one-sided residuals are those from `first` up to `last`.
-    """
-
-    residual: Float[Array, " residuals"]
-    jacobian: Float[Array, "residuals parameters"]
-    first: int = eqx.field(static=True)
-    last: int = eqx.field(static=True)
-
-    @property
-    def one_sided(self) -> slice:
-        """Slice of the one-sided residuals."""
-        return slice(self.first, self.last)
-
-    @property
-    def positive(self) -> Bool[Array, " one_sided"]:
-        """True for one-sided residuals that count, because they are positive."""
-        return self.residual[self.one_sided] > 0
-
-    @property
-    def active_residuals(self) -> Float[Array, " residuals"]:
-        """Residuals, with zeros for inactive one-sided ones."""
-        return self.residual.at[self.one_sided].set(jnp.where(self.positive, self.residual[self.one_sided], 0.0))
-
-    @property
-    def objective(self) -> Float[Array, ""]:
-        """Half the sum of squares of the residuals that count."""
-        return half_squares(self.residual, self.one_sided)
-
-
 def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
     """A step, corrected by the change of the linearised step since the previous point.
 
@@ -131,12 +102,13 @@ def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
 
 
 class SearchState(eqx.Module):
-    """State of a search between two steps. The caller of the solver keeps y, the best point so far.
+    """State of a search between two steps.
 
     Attributes:
-        found: linearisation at y.
-        slope: Jacobian for the next step, corrected by rejected steps.
+        y: best point so far.
+        residual, jacobian: residuals there (one-sided ones with their signs), and their Jacobian.
         aux: auxiliary output of its evaluation.
+        slope: Jacobian for the next step, corrected by rejected steps.
         stride: linearised step at y.
         ahead: point of the next evaluation.
         mixed: True if `mixed_step` leads to that point.
@@ -146,9 +118,11 @@ class SearchState(eqx.Module):
         over: True if the search has ended.
     """
 
-    found: SolverLinearisation
-    slope: Float[Array, "residuals parameters"]
+    y: Z
+    residual: Float[Array, " residuals"]
+    jacobian: Float[Array, "residuals parameters"]
     aux: Any
+    slope: Float[Array, "residuals parameters"]
     stride: Z
     ahead: Z
     mixed: Bool[Array, ""]
@@ -185,61 +159,55 @@ class OneSidedLevenbergMarquardt(eqx.Module):
 
     def begin(self, y: Z, residuals: int, aux: Any) -> SearchState:
         """State of a search before its first evaluation. `aux`: shapes and types of the auxiliary output."""
-        none, no, still = jnp.asarray(0), jnp.asarray(False), jnp.zeros_like(y)
-        jacobian = jnp.zeros((residuals, y.size), y.dtype)
-        unevaluated = SolverLinearisation(jnp.zeros(residuals, y.dtype), jacobian, self.first, self.last)
+        none, no, jacobian = jnp.asarray(0), jnp.asarray(False), jnp.zeros((residuals, y.size), y.dtype)
         aux = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux)
-        return SearchState(unevaluated, jacobian, aux, still, y, no, jnp.asarray(1.0), none, none, no)
+        evaluation, still = (jnp.zeros(residuals, y.dtype), jacobian, aux), jnp.zeros_like(y)
+        return SearchState(y, *evaluation, jacobian, still, y, no, jnp.asarray(1.0), none, none, no)
 
-    def step(self, y: Z, state: SearchState, residual: Array, jacobian: Array, aux: Any) -> tuple[Z, SearchState]:
+    def step(self, state: SearchState, residual: Array, jacobian: Array, aux: Any) -> SearchState:
         """Accepts or rejects the last step, given the evaluation at its end, and finds the next one.
 
         Args:
-            y: best point so far.
             residual, jacobian, aux: residuals (one-sided ones with their signs) at `state.ahead`, their Jacobian and
                 auxiliary output.
         """
-        linearised = SolverLinearisation(residual, jacobian, self.first, self.last)
-        last_step, first = state.ahead - y, state.steps == 0
-        before = dataclasses.replace(state.found, jacobian=state.slope)
+        one_sided = slice(self.first, self.last)
+        last_step, first = state.ahead - state.y, state.steps == 0
+        objective, objective_before = (half_squares(r, one_sided) for r in (residual, state.residual))
         # A mixed step whose prediction is a rise counts as one of no change.
-        predicted = half_squares(before.residual + before.jacobian @ last_step, before.one_sided) - before.objective
-        predicted, change = jnp.minimum(predicted, 0.0), linearised.objective - before.objective
+        predicted = half_squares(state.residual + state.slope @ last_step, one_sided) - objective_before
+        predicted, change = jnp.minimum(predicted, 0.0), objective - objective_before
         accepted = first | (change <= LITTLE * predicted)
         good = ~first & (change < NEARLY_ALL * predicted) & (predicted < 0)
         region = state.region * jnp.where(accepted, jnp.where(good, LONGER, 1), SHORTER)
-        alike = jnp.all(linearised.positive == before.positive)
+        alike = jnp.all((residual[one_sided] > 0) == (state.residual[one_sided] > 0))
         accepted &= first | alike | ~state.mixed
         region = jnp.where(state.mixed & ~accepted, state.region, region)
-        has_converged = self._is_small(state.ahead, last_step, linearised, before) & accepted
+        # Converged if an accepted step changed neither y nor any residual that counts by more than the tolerance.
+        changed = active_residuals(residual, one_sided) - active_residuals(state.residual, one_sided)
+        sizes = (last_step, state.ahead), (changed, residual)
+        moved, change = (jnp.max(jnp.abs(x / (self.tolerance + self.tolerance * jnp.abs(at)))) for x, at in sizes)
+        has_converged = (moved < 1) & (change < 1) & accepted
 
         corrected = state.slope
         if self.rough:
-            least = jnp.finfo(y.dtype).tiny
+            least = jnp.finfo(residual.dtype).tiny
             projection, length = corrected @ last_step, jnp.maximum(last_step @ last_step, least)
-            missed = linearised.residual - before.residual - projection
-            near = (state.steps > 0) & (linearised.objective < TELLING * before.objective)
+            missed = residual - state.residual - projection
+            near = (state.steps > 0) & (objective < TELLING * objective_before)
             corrected = jnp.where(near, corrected + jnp.outer(missed, last_step) / length, corrected)
             half = jnp.minimum(region, length / jnp.maximum(projection @ projection, least))
             region = jnp.where(accepted | state.mixed, region, half)
-        slope = jnp.where(accepted, linearised.jacobian, corrected)
-        y, best, aux = _select(accepted, (state.ahead, linearised, aux), (y, state.found, state.aux))
+        y, residual, jacobian, aux, slope = jax.tree.map(
+            lambda new, old: jnp.where(accepted, new, old),
+            (state.ahead, residual, jacobian, aux, jacobian),
+            (state.y, state.residual, state.jacobian, state.aux, corrected),
+        )
         tiny = jnp.finfo(region.dtype)
         damping = jnp.where(region > tiny.eps, 1 / jnp.maximum(region, tiny.eps), tiny.max)
-        stride = one_sided_step(best.residual, slope, best.one_sided, damping)
+        stride = one_sided_step(residual, slope, one_sided, damping)
         mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
-        next_y = y + jnp.where(mixed, mixed_step(stride, last_step, stride - state.stride), stride)
+        ahead = y + jnp.where(mixed, mixed_step(stride, last_step, stride - state.stride), stride)
         rejected = jnp.where(accepted, 0, state.rejected + 1)
-        is_over = has_converged | (rejected >= PATIENCE)
-        return y, SearchState(best, slope, aux, stride, next_y, mixed, region, state.steps + 1, rejected, is_over)
-
-    def _is_small(self, y: Z, moved: Z, found: SolverLinearisation, before: SolverLinearisation) -> Array:
-        """True if a step changed neither y nor any residual that counts by more than the tolerance."""
-        changed = found.active_residuals - before.active_residuals
-        sizes = (moved, y), (changed, found.residual)
-        steps, residuals = (jnp.max(jnp.abs(x / (self.tolerance + self.tolerance * jnp.abs(at)))) for x, at in sizes)
-        return (steps < 1) & (residuals < 1)
-
-
-def _select(chosen: Array, a: Any, b: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), a, b)
+        evaluation, is_over = (residual, jacobian, aux), has_converged | (rejected >= PATIENCE)
+        return SearchState(y, *evaluation, slope, stride, ahead, mixed, region, state.steps + 1, rejected, is_over)

@@ -227,8 +227,7 @@ def optimum_of_population(
     error = np.concatenate([np.asarray(posed.whitened(observation)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
     jacobian = jnp.asarray(np.concatenate([searched.slope, rows, np.eye(len(z))]))
-    pin, point, count = optimizers.no_pin(len(z)), jnp.asarray(z), jnp.asarray(0)
-    best = optimizers.optimum_at(jacobian, jnp.asarray(error), point, posed.data, pin, count, jacobian)
+    best = optimizers.optimum_at(jacobian, jnp.asarray(error), jnp.asarray(z), posed.data, jnp.asarray(0), jacobian)
     settled = np.array([searched.found.settled])
     best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
     start_outcomes = StartOutcomes(

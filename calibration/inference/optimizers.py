@@ -55,21 +55,6 @@ Z = Float[Array, " parameters"]
 Numbers = Any
 
 
-class Pin(eqx.Module):
-    """Coordinates that are held at a value: `z[k] = at[k]` where `held[k]` is True."""
-
-    held: Bool[Array, " parameters"]
-    at: Z
-
-    def apply(self, z: Z) -> Z:
-        return jnp.where(self.held, self.at, z)
-
-
-def no_pin(size: int) -> Pin:
-    """Pin that holds no coordinate."""
-    return Pin(jnp.zeros(size, bool), jnp.zeros(size))
-
-
 class Optimum(eqx.Module):
     """End of one search.
 
@@ -104,18 +89,14 @@ def informative_residuals(data: Data) -> np.ndarray:
     return np.r_[: penalties.start, penalties.stop : penalties.stop + data.centre.size]
 
 
-#: A search between two steps: the best point so far and the solver's state.
-Progress = tuple[Z, SearchState]
-
-
-def _evaluate_residuals(problem: Problem, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
+def _evaluate_residuals(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
     """Residuals (readings, penalties with their signs, priors) at z, their Jacobian, and the observation.
 
     All three come from one evaluation of the model.
     """
-    r, jacobian, observation, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z)
-    prior = jnp.where(pin.held, z - pin.at, z - problem.data.centre)
-    return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), observation
+    r, jacobian, observation, _ = problem.linearised(problem.robot, z)
+    r = jnp.concatenate([r, z - problem.data.centre])
+    return r, jnp.concatenate([jacobian, jnp.eye(z.size)]), observation
 
 
 def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
@@ -126,65 +107,73 @@ def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     )
 
 
-def optimum_at(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array, slope: Array) -> Optimum:
+def optimum_at(jacobian: Array, r: Array, z: Array, data: Data, steps: Array, slope: Array) -> Optimum:
     """Optimum record of a point. `slope` is the Jacobian that predicts its decrement."""
-    held_rows = adhesion_penalty_slice(data)
+    penalties = adhesion_penalty_slice(data)
     informed = jacobian[informative_residuals(data)]
     half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
-    sd = jnp.linalg.norm(half, axis=0)
-    residual_after_step = r + slope @ one_sided_step(r, slope, held_rows, 0.0)
-    decrement = half_squares(r, held_rows) - half_squares(residual_after_step, held_rows)
-    pinned_offset = jnp.where(pin.held, pin.at - data.centre, 0.0)
-    cost = half_squares(r, held_rows) + 0.5 * jnp.sum(pinned_offset**2)
-    return Optimum(
-        pin.apply(z),
-        sd,
-        half.T @ half,
-        cost,
-        decrement,
-        jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost),
-        steps,
-    )
+    cost = half_squares(r, penalties)
+    decrement = cost - half_squares(r + slope @ one_sided_step(r, slope, penalties, 0.0), penalties)
+    converged = jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost)
+    return Optimum(z, jnp.linalg.norm(half, axis=0), half.T @ half, cost, decrement, converged, steps)
 
 
-def _begin_search(problem: Problem, start: Z) -> Progress:
+def _begin_search(problem: Problem, start: Z) -> SearchState:
     """State of a problem's search before its first evaluation."""
     data = problem.data
     size, codes = adhesion_penalty_slice(data).stop + start.shape[0], jnp.zeros(data.measured.shape[0], int)
     aux = jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
-    return start, _least_squares_solver(data, problem.observe.long).begin(start, size, aux)
+    return _least_squares_solver(data, problem.observe.long).begin(start, size, aux)
 
 
-def _advance_search(problem: Problem, pin: Pin, at: Progress, max_steps: int | Numbers) -> Progress:
+def _advance_search(problem: Problem, at: SearchState, max_steps: int | Numbers) -> SearchState:
     """One step of a problem's search.
 
     The compiled program evaluates the model in one place, at the start of a step. The point that is accepted there is
     the result of the search, with its residuals, Jacobian and observation.
     """
     solver = _least_squares_solver(problem.data, problem.observe.long)
-    r, jacobian, observation = _evaluate_residuals(problem, pin, at[1].ahead)
-    y, state = solver.step(*at, r, jacobian, observation)
-    is_over = state.over | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
-    return y, dataclasses.replace(state, over=is_over)
+    state = solver.step(at, *_evaluate_residuals(problem, at.ahead))
+    is_over = state.over | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(state.y))
+    return dataclasses.replace(state, over=is_over)
 
 
-def _optimum_of_progress(at: Progress, data: Data, pin: Pin) -> Optimum:
-    y, state = at
-    r = jnp.where(jnp.all(jnp.isfinite(y)), state.found.residual, jnp.nan)
-    return optimum_at(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
+def _optimum_of_state(at: SearchState, data: Data) -> Optimum:
+    r = jnp.where(jnp.all(jnp.isfinite(at.y)), at.residual, jnp.nan)
+    return optimum_at(at.jacobian, r, at.y, data, at.steps, at.slope)
 
 
-def levenberg_marquardt(
-    problem: Problem, start: Z, pin: Pin | None = None, max_steps: int = 100
-) -> tuple[Optimum, Observation]:
-    """Optimum of one search, and the observation there. It can be vmapped over problems, starts and pins."""
-    held = no_pin(start.shape[0]) if pin is None else pin
+def levenberg_marquardt(problem: Problem, start: Z, max_steps: int = 100) -> tuple[Optimum, Observation]:
+    """Optimum of one search, and the observation there. It can be vmapped over problems and starts."""
 
-    def advance(at: Progress) -> Progress:
-        return _advance_search(problem, held, at, max_steps)
+    def advance(at: SearchState) -> SearchState:
+        return _advance_search(problem, at, max_steps)
 
-    at = jax.lax.while_loop(lambda at: ~at[1].over, advance, _begin_search(problem, held.apply(start)))
-    return _optimum_of_progress(at, problem.data, held), at[1].aux
+    at = jax.lax.while_loop(lambda at: ~at.over, advance, _begin_search(problem, start))
+    return _optimum_of_state(at, problem.data), at.aux
+
+
+class HeldCoordinates(eqx.Module):
+    """Coordinates of which some are held: `z[k] = values[k]` where `held[k]` is True."""
+
+    coordinates: Any
+    held: Bool[Array, " parameters"]
+    values: Z
+
+    def robot(self, base: Robot, z: Z) -> Robot:
+        return self.coordinates.robot(base, jnp.where(self.held, self.values, z))
+
+
+@compiled
+def fit_with_held(problem: Problem, starts: Array, held: Array, max_steps: int = 100) -> Optimum:
+    """Optimum from each start with some of its coordinates held. Their priors are left out of its cost."""
+
+    def fit(start: Z, held: Array) -> Optimum:
+        coordinates = HeldCoordinates(problem.coordinates, held, start)
+        of_start = problem.with_data(centre=jnp.where(held, start, problem.data.centre))
+        return levenberg_marquardt(dataclasses.replace(of_start, coordinates=coordinates), start, max_steps)[0]
+
+    return jax.vmap(fit)(starts, held)
 
 
 class SearchMember(eqx.Module):
@@ -210,20 +199,16 @@ class SearchMember(eqx.Module):
 
 
 @functools.partial(compiled, options=SELDOM)
-def _placeholder_searches(problem: Problem, members: SearchMember) -> Progress:
+def _placeholder_searches(problem: Problem, members: SearchMember) -> SearchState:
     """States of searches that have already ended, as placeholders."""
-
-    def placeholder(member: SearchMember) -> Progress:
-        y, state = _begin_search(member.problem(problem), member.start)
-        return y, dataclasses.replace(state, over=jnp.asarray(True))
-
-    return jax.vmap(placeholder)(members)
+    at = jax.vmap(lambda member: _begin_search(member.problem(problem), member.start))(members)
+    return dataclasses.replace(at, over=jnp.ones_like(at.over))
 
 
-def _start_fresh_searches(problem: Problem, members: SearchMember, fresh: Numbers, at: Progress) -> Progress:
+def _start_fresh_searches(problem: Problem, members: SearchMember, fresh: Numbers, at: SearchState) -> SearchState:
     """States of parallel searches after the `fresh` ones were reset to their starts."""
 
-    def begin(member: SearchMember, fresh: Array, at: Progress) -> Progress:
+    def begin(member: SearchMember, fresh: Array, at: SearchState) -> SearchState:
         search_begin = _begin_search(member.problem(problem), member.start)
         return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), search_begin, at)
 
@@ -233,20 +218,32 @@ def _start_fresh_searches(problem: Problem, members: SearchMember, fresh: Number
 _admitted = compiled(_start_fresh_searches, options=SELDOM)
 
 
+def _step_unfinished(
+    problem: Problem, members: SearchMember, at: SearchState, roots: tuple[Array, Array] | None, max_steps: Numbers
+) -> SearchState:
+    """One step of each unfinished search. `roots`: solved rows of each, if a separate program solves them."""
+
+    def advance(member: SearchMember, at: SearchState, roots: tuple[Array, Array] | None) -> SearchState:
+        new = _advance_search(dataclasses.replace(member.problem(problem), roots=roots), at, max_steps)
+        return jax.tree.map(lambda new, old: jnp.where(at.over, old, new), new, at)
+
+    return jax.vmap(advance)(members, at, roots)
+
+
+def _optima_of_states(problem: Problem, members: SearchMember, at: SearchState) -> Optimum:
+    return jax.vmap(lambda member, at: _optimum_of_state(at, member.problem(problem).data))(members, at)
+
+
 def _continue_searches(
-    problem: Problem, members: SearchMember, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
-) -> tuple[Progress, Optimum]:
+    problem: Problem, members: SearchMember, fresh: Numbers, at: SearchState, enough: Numbers, max_steps: Numbers
+) -> tuple[SearchState, Optimum]:
     """Continues parallel searches until `enough` of them have ended. `fresh` ones begin at their starts."""
-    pin = no_pin(members.start.shape[-1])
-
-    def advance(member: SearchMember, at: Progress) -> Progress:
-        member_problem = member.problem(problem)
-        new = _advance_search(member_problem, pin, at, max_steps)
-        return jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
-
-    at = _start_fresh_searches(problem, members, fresh, at)
-    at = jax.lax.while_loop(lambda at: jnp.sum(at[1].over) < enough, lambda at: jax.vmap(advance)(members, at), at)
-    return at, jax.vmap(lambda member, at: _optimum_of_progress(at, member.problem(problem).data, pin))(members, at)
+    at = jax.lax.while_loop(
+        lambda at: jnp.sum(at.over) < enough,
+        lambda at: _step_unfinished(problem, members, at, None, max_steps),
+        _start_fresh_searches(problem, members, fresh, at),
+    )
+    return at, _optima_of_states(problem, members, at)
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -263,31 +260,22 @@ def _solve_rows(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[A
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _step_unfinished(
-    problem: Problem, members: SearchMember, at: Progress, roots: tuple[Array, Array], max_steps: Numbers
-) -> tuple[Progress, Optimum]:
-    """One step of each unfinished search, given its solved rows, and the best point of each search."""
-    pin = no_pin(members.start.shape[-1])
-
-    def advance(member: SearchMember, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
-        member_problem = dataclasses.replace(member.problem(problem), roots=roots)
-        new = _advance_search(member_problem, pin, at, max_steps)
-        new = jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
-        return new, _optimum_of_progress(new, member_problem.data, pin)
-
-    return jax.vmap(advance)(members, at, roots)
+def _step_with_roots(
+    problem: Problem, members: SearchMember, at: SearchState, roots: tuple[Array, Array], max_steps: Numbers
+) -> tuple[SearchState, Optimum]:
+    at = _step_unfinished(problem, members, at, roots, max_steps)
+    return at, _optima_of_states(problem, members, at)
 
 
 def _continue_searches_separately(
-    problem: Problem, members: SearchMember, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
-) -> tuple[Progress, Optimum]:
+    problem: Problem, members: SearchMember, fresh: Numbers, at: SearchState, enough: Numbers, max_steps: Numbers
+) -> tuple[SearchState, Optimum]:
     """`_continue_searches` for observers whose rows are solved by a separate program (`Observer.apart`)."""
     at = _admitted(problem, members, fresh, at)
     while True:
-        at, results = _step_unfinished(
-            problem, members, at, _solve_rows(problem, at[1].ahead, members.active), max_steps
-        )
-        if np.asarray(at[1].over).sum() >= enough:
+        roots = _solve_rows(problem, at.ahead, members.active)
+        at, results = _step_with_roots(problem, members, at, roots, max_steps)
+        if np.asarray(at.over).sum() >= enough:
             return at, results
 
 
@@ -401,7 +389,7 @@ def _search_with_states(
             running = int(assigned.taken.sum())
             enough = places - running + (max(1, places // 4) if assigned.waiting else running)
             states, results = go_on(problem, own_members, fresh, states, np.asarray(enough), step_limit)
-            assigned.leave(*jax.device_get((states[1].over, (results, states[1]))))
+            assigned.leave(*jax.device_get((states.over, (results, states))))
         return assigned.ended
 
     if cores > 1:  # compiles the program once, by a call that takes no step
@@ -427,7 +415,7 @@ def _linearise_by_search_program(problem: Problem, z: Z) -> tuple[Array, Array, 
     members = jax.tree.map(lambda x: np.asarray(x)[None], member)
     _, final_states = _search_with_states(problem, members, 1, problem.observe.searches_per_core(problem))
     state = jax.tree.map(lambda x: jnp.asarray(x[0]), final_states)
-    return state.found.residual, state.found.jacobian, state.aux
+    return state.residual, state.jacobian, state.aux
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -453,7 +441,7 @@ def linearise_rollout(problem: Problem, z: Z) -> tuple[Array, Array, Observation
     If a step of the rollout is too long for its friction law (V_s small compared with μ_s), the run oscillates and
     its derivative grows without limit. Such a reading counts as not computed, if it has a weight.
     """
-    r, jacobian, observation = _evaluate_residuals(problem, no_pin(z.size), z)
+    r, jacobian, observation = _evaluate_residuals(problem, z)
     return *mask_uncomputed(r, jacobian, problem.data), observation
 
 
@@ -478,25 +466,24 @@ def search_rollout(
     Returns:
         The optimum, and the observations at the start and at the end.
     """
-    progress, first = _begin_search(problem, start), None
+    state, first = _begin_search(problem, start), None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
-        state = progress[1]
         # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
         r = evaluate_residuals(problem, state.ahead) if state.rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
             r, jacobian, observation = linearise_rollout(problem, state.ahead)
         first = observation if first is None else first
-        progress, end = _step_search(progress, (r, jacobian, observation), problem.data)
-        done = bool(progress[1].over)
-        if best is None or progress[1].rejected == 0:  # the first step only evaluates the start
+        state, end = _step_search(state, (r, jacobian, observation), problem.data)
+        done = bool(state.over)
+        if best is None or state.rejected == 0:  # the first step only evaluates the start
             best = end
             done |= bool(end.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * end.cost))
         tell(steps, float(best.cost))
         if done:
             break
     assert best is not None and first is not None
-    return best, first, progress[1].aux
+    return best, first, state.aux
 
 
 #: Function of members' coordinates and indices: residuals, penalties with their signs, their Jacobian and the
@@ -505,10 +492,10 @@ Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Obse
 
 
 @functools.partial(compiled, options=SELDOM)
-def _step_search(at: Progress, found: tuple[Array, Array, Any], data: Data) -> tuple[Progress, Optimum]:
+def _step_search(at: SearchState, evaluation: tuple[Array, Array, Any], data: Data) -> tuple[SearchState, Optimum]:
     """Next step of a search, and its best point."""
-    new = _least_squares_solver(data, long=True).step(*at, *found)
-    return new, _optimum_of_progress(new, data, no_pin(at[0].shape[-1]))
+    new = _least_squares_solver(data, long=True).step(at, *evaluation)
+    return new, _optimum_of_state(new, data)
 
 
 def search_rollouts(
@@ -553,10 +540,9 @@ def search_rollouts(
         for j, k in enumerate(going):  # one at a time, so that one program serves any number of searches
             evaluation = jax.tree.map(lambda x: x[j], evaluated)  # noqa: B023
             if k in fresh:
-                first_progress = ahead[k], solver.begin(ahead[k], evaluation[0].size, evaluation[2])
-                searches[k] = jax.device_get(first_progress), None
+                searches[k] = jax.device_get(solver.begin(ahead[k], evaluation[0].size, evaluation[2])), None
             searches[k] = jax.device_get(_step_search(searches[k][0], evaluation, data))
-        results = [(s.over, s.steps, s.ahead, s.aux, end) for (_, s), end in searches]
+        results = [(s.over, s.steps, s.ahead, s.aux, end) for s, end in searches]
         finished, steps, ahead, observation, ends = jax.tree.map(lambda *x: np.stack(x), *results)
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
         is_over = finished | (steps >= max_steps) | (ends.decrement < small)

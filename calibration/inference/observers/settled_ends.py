@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from scipy.special import ndtr
 
 from calibration.inference.observers.settled import SettledRuns
-from calibration.inference.optimizers import CORES, Optimum, Pin, levenberg_marquardt
+from calibration.inference.optimizers import CORES, Optimum, fit_with_held
 from calibration.inference.priors import TIED
 from calibration.inference.problem import Problem, data_from_readings
 from mmrjax.compile.compiling import Threads, compiled
@@ -225,8 +225,9 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
     pinned, is_pinned = np.zeros((len(ADHESIONS), len(names))), np.zeros((len(ADHESIONS), len(names)), bool)
     for k in (k for k, n in enumerate(names) if n.endswith(STATIC)):
         pinned[:, k], is_pinned[:, k] = [_coordinate_of_value(problem, k, x) for x in ADHESIONS], True
-    fitted = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(pinned), jnp.asarray(is_pinned)))
-    free = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(fitted.z), jnp.zeros(is_pinned.shape, bool)))
+    fitted = jax.device_get(fit_with_held(ends_problem, jnp.asarray(pinned), jnp.asarray(is_pinned), STEPS))
+    free = fit_with_held(ends_problem, jnp.asarray(fitted.z), jnp.zeros(is_pinned.shape, bool), STEPS)
+    free = jax.device_get(free)
     best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
     finite_points = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
     return np.stack([_with_friction_slope(problem, z, share) for z in finite_points for share in FINER])
@@ -264,13 +265,6 @@ def _with_friction_slope(problem: Problem, z: np.ndarray, share: float) -> np.nd
     coordinate = np.where(c.scale, np.log(np.maximum(value, 1e-12)), value)
     changed = value != c.value(np.asarray(z))
     return np.where(changed, (coordinate - np.asarray(c.location)) / np.asarray(c.spread), z)
-
-
-@compiled
-def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
-    return jax.vmap(lambda z, pinned: levenberg_marquardt(problem, z, Pin(pinned, z), max_steps=STEPS)[0])(
-        starts, held
-    )
 
 
 @compiled
