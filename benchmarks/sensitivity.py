@@ -123,31 +123,31 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
     held = np.zeros((2, 3))
     for seed in range(seeds):
         design = sampled_indices.sobol_design(3, size, seed)
-        found = sampled_indices.sobol_terms(design, ishigami(design.points))
+        found = sampled_indices.sobol_terms(design, ishigami(design))
         assert found is not None
-        indices = sampled_indices.indices_of_terms(found)
-        for k, (true, e) in enumerate(zip(exact, (indices.first, indices.total), strict=True)):
+        indices = sampled_indices.sobol_indices(found)
+        for k, (true, e) in enumerate(zip(exact, (indices["first"], indices["total"]), strict=True)):
             held[k] += (e.low <= true) & (true <= e.high)
     record["ishigami"] = {"first": (held[0] / seeds).tolist(), "total": (held[1] / seeds).tolist()}
     print("Ishigami, share of seeds whose interval holds the index:", record["ishigami"], flush=True)
 
     inputs, model, conditions = ours()
     design = sampled_indices.sobol_design(len(NAMES), reference_size, 2**31)
-    values = inputs.values(inputs.scores(design.points))
+    values = inputs.values(inputs.scores(design))
     began = time.perf_counter()
     by = by_scipy(values[:, : len(NAMES)])
     print(f"reference: {len(values)} roots by SciPy in {time.perf_counter() - began:.0f} s", flush=True)
-    known = [sampled_indices.indices_of_terms(sampled_indices.sobol_terms(design, by[:, j])) for j in range(3)]  # type: ignore[arg-type]
+    known = [sampled_indices.sobol_indices(sampled_indices.sobol_terms(design, by[:, j])) for j in range(3)]  # type: ignore[arg-type]
     held = np.zeros((3, 2, len(NAMES)))
     for seed in range(seeds):
         design = sampled_indices.sobol_design(len(NAMES), size, seed)
-        values = inputs.values(inputs.scores(design.points))
+        values = inputs.values(inputs.scores(design))
         answer = model(values, conditions)
         for j, name in enumerate(OUTPUTS):
             found = sampled_indices.sobol_terms(design, answer.values[name])
             assert found is not None
-            indices = sampled_indices.indices_of_terms(found)
-            pairs = ((indices.first, known[j].first), (indices.total, known[j].total))
+            indices = sampled_indices.sobol_indices(found)
+            pairs = [(indices[order], known[j][order]) for order in ("first", "total")]
             for k, (e, true) in enumerate(pairs):
                 held[j, k] += (e.low <= true.value) & (true.value <= e.high)
     share = held / seeds
@@ -155,7 +155,7 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
         name: {"first": share[j, 0].tolist(), "total": share[j, 1].tolist()} for j, name in enumerate(OUTPUTS)
     }
     record["reference"] = {
-        name: {"first": known[j].first.value.tolist(), "total": known[j].total.value.tolist()}
+        name: {"first": known[j]["first"].value.tolist(), "total": known[j]["total"].value.tolist()}
         for j, name in enumerate(OUTPUTS)
     }
     inside = (share >= 0.9) & (share <= 0.98)
@@ -173,7 +173,7 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
     inputs, model, conditions = ours()
     blocks = 2 * len(NAMES) + 2
     design = sampled_indices.sobol_design(len(NAMES), 2 ** int(np.log2(points / 32 / blocks)), 0)
-    values = inputs.values(inputs.scores(design.points))
+    values = inputs.values(inputs.scores(design))
     own = values[:, : len(NAMES)]
     some = own[:: max(len(own) // 2000, 1)]
     began = time.perf_counter()

@@ -16,7 +16,7 @@ from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import OperatingPoints
-from calibration.sensitivity.study import Study, inert_inputs, local_derivatives
+from calibration.sensitivity.study import Study, inert_inputs, local_studies
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps.report import sensitivity_report
@@ -48,7 +48,7 @@ def study(robot):
 
 @pytest.mark.slow
 def test_local_derivatives_are_finite_differences_and_zero_across_configurations(study, robot):
-    found = local_derivatives(study)
+    found, statuses = local_studies(study)
     step = 1e-6
     fields = params.parameters_by_name(robot)
     for k, name in enumerate(NAMES):
@@ -58,20 +58,20 @@ def test_local_derivatives_are_finite_differences_and_zero_across_configurations
             for s in (step, -step)
         )
         twice = np.asarray(up - down) / (2 * step * value)
-        assert_allclose(found.derivative["total_current"][:3, k], twice[:3], rtol=1e-6, atol=1e-7)
-    assert np.isnan(found.derivative["total_current"][3]).all()  # it slides at 25°
-    assert found.derivative["speed"][1, 1] == 0 and found.derivative["speed"][0, 2] == 0
-    assert found.statuses == {"steady": {"converged": 3, "slides": 1}}
+        assert_allclose(found["total_current"].derivative[:3, k], twice[:3], rtol=1e-6, atol=1e-7)
+    assert np.isnan(found["total_current"].derivative[3]).all()  # it slides at 25°
+    assert found["speed"].derivative[1, 1] == 0 and found["speed"].derivative[0, 2] == 0
+    assert statuses == {"steady": {"converged": 3, "slides": 1}}
 
 
 @pytest.mark.slow
 def test_swings_are_runs_at_the_ends_of_the_intervals(study, robot):
-    found = local_derivatives(study)
+    found, _ = local_studies(study)
     coordinates = priors.parameter_coordinates(robot, NAMES)
     for side, z in enumerate((-1.959963984540054, 1.959963984540054)):
         value = coordinates.value(jnp.zeros(4).at[1].set(z))[1]
         run = steady_batch(params.replace(robot, {NAMES[1]: value}), study.conditions)
-        assert_allclose(found.swing["speed"][side, :3, 1], run.speed[:3], rtol=1e-9)
+        assert_allclose(found["speed"].swing[side, :3, 1], run.speed[:3], rtol=1e-9)
 
 
 def test_inputs_are_those_of_the_priors(robot, study):
@@ -128,7 +128,7 @@ def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance
     )
     points = OperatingPoints(*(x[:1] for x in study.points.columns().values()))
     one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
-    assert_array_equal(inert_inputs(one, local_derivatives(one), 0), [False, True])
+    assert_array_equal(inert_inputs(one, local_studies(one)[0], 0), [False, True])
 
 
 # --- the command ------------------------------------------------------------------------------------------------

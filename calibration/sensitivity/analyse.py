@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,16 +17,13 @@ from calibration.sensitivity import sampled_indices
 from calibration.sensitivity.result import InputSummary, OutputStudy, SensitivityResult
 from calibration.sensitivity.sampled_indices import IntervalEstimate
 from calibration.sensitivity.study import (
-    LocalDerivatives,
     Study,
-    correlated_directions,
     inert_inputs,
     interval_ends,
-    local_derivatives,
+    local_studies,
 )
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax import derived, fidelities
-from mmrjax.model.quantities import Quantity
 
 #: Largest share of base points without a value at an operating point that is studied.
 MOST_LOST = 0.5
@@ -76,55 +73,52 @@ def _results_at_points(
         yield name, dataclasses.replace(local, share=share, lost=lost[name], studied=studied), results[name]
 
 
-def _estimates_by_point(study: Study, by_point: Mapping[int, IntervalEstimate]) -> IntervalEstimate:
-    """Estimates at each point, shape (points, inputs), NaN at points without one."""
-    estimates = np.full((3, len(study.points), len(study.inputs)), np.nan)
-    for k, estimate in by_point.items():
-        estimates[:, k] = estimate
-    return IntervalEstimate(*estimates)
+def _estimates_at_points(
+    study: Study, by_point: Mapping[int, Mapping[str, IntervalEstimate]], names: Iterable[str]
+) -> dict[str, IntervalEstimate]:
+    """Estimates at each point, by name, shape (points, inputs), NaN at points without one."""
+    every = {name: np.full((3, len(study.points), len(study.inputs)), np.nan) for name in names}
+    for name, estimates in every.items():
+        for k, of_point in by_point.items():
+            estimates[:, k] = of_point[name]
+    return {name: IntervalEstimate(*estimates) for name, estimates in every.items()}
 
 
-def sobol_indices(
+def sobol_study(
     study: Study, studies: dict[str, OutputStudy], moving: np.ndarray, evaluations: int, seed: int
 ) -> dict[str, OutputStudy]:
     """First-order, total and second-order Sobol indices at each point and over all points."""
 
     def design(input_set: tuple[int, ...]) -> tuple[np.ndarray, Analyse]:
         size = sampled_indices.base_point_count(evaluations / len(study.points), len(input_set))
-        sobol = sampled_indices.sobol_design(len(input_set), size, seed)
+        unit = sampled_indices.sobol_design(len(input_set), size, seed)
 
         def analyse(values: np.ndarray) -> tuple[Any, float]:
-            terms = sampled_indices.sobol_terms(sobol, values)
+            terms = sampled_indices.sobol_terms(unit, values)
             if terms is None:
                 return None, 1.0
             return terms.widened(input_set, len(study.inputs)), terms.lost / (size * sampled_indices.REPLICATES)
 
-        return _sampled_scores(study, sobol.points, input_set), analyse
+        return _sampled_scores(study, unit, input_set), analyse
 
     answer = {}
     for name, output, terms in _results_at_points(study, studies, moving, design):
         if terms:
-            indices = {k: sampled_indices.indices_of_terms(of_point) for k, of_point in terms.items()}
-            overall = sampled_indices.indices_of_terms(functools.reduce(operator.add, terms.values()))
-            total = _estimates_by_point(study, {k: of_point.total for k, of_point in indices.items()})
+            indices = {k: sampled_indices.sobol_indices(of_point) for k, of_point in terms.items()}
+            overall = sampled_indices.sobol_indices(functools.reduce(operator.add, terms.values()))
+            second = overall.pop("second")
+            at_points = _estimates_at_points(study, indices, overall)
             sd = np.full(len(study.points), np.nan)
-            sd[list(indices)] = np.sqrt([of_point.variance for of_point in indices.values()])
+            sd[list(terms)] = np.sqrt([of_point.variance.mean() for of_point in terms.values()])
             output = dataclasses.replace(
-                output,
-                overall={"first": overall.first, "total": overall.total},
-                at_points={
-                    "first": _estimates_by_point(study, {k: of_point.first for k, of_point in indices.items()}),
-                    "total": total,
-                },
-                share=np.clip(total.value, 0.0, 1.0),
-                sd=sd,
-                second=overall.second,
-            )
+                output, overall=overall, at_points=at_points, share=np.clip(at_points["total"].value, 0.0, 1.0),
+                sd=sd, second=second,
+            )  # fmt: skip
         answer[name] = output
     return answer
 
 
-def morris_screening(
+def morris_study(
     study: Study, studies: dict[str, OutputStudy], moving: np.ndarray, evaluations: int, seed: int
 ) -> dict[str, OutputStudy]:
     """Elementary effects (Morris) over the 95 % range of each input, at each point."""
@@ -155,10 +149,7 @@ def morris_screening(
     answer = {}
     for name, output, effects in _results_at_points(study, studies, moving, design):
         if effects:
-            keys = next(iter(effects.values()))
-            at_points = {
-                key: _estimates_by_point(study, {k: of_point[key] for k, of_point in effects.items()}) for key in keys
-            }
+            at_points = _estimates_at_points(study, effects, next(iter(effects.values())))
             square = at_points["mean_absolute_effect"].value ** 2
             total = square.sum(1, keepdims=True)
             output = dataclasses.replace(
@@ -201,16 +192,15 @@ def analyse_sensitivity(study: Study, method: str, evaluations: int | None, seed
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
     study.tell(progress_remark("points"))
-    studies = local_derivatives(study)
-    if not any(np.isfinite(x).any() for x in studies.value.values()):
-        raise BadConfiguration(_no_point_message(studies.statuses))
-    idle = inert_inputs(study, studies, seed)
+    outputs, statuses = local_studies(study)
+    if not any(np.isfinite(o.value).any() for o in outputs.values()):
+        raise BadConfiguration(_no_point_message(statuses))
+    idle = inert_inputs(study, outputs, seed)
     if idle.all():
         raise BadConfiguration("--parameters: every derivative is zero; choose others, or change --outputs")
-    outputs = {o.name: _local_study(o, study, studies) for o in model.outputs}
     if method != "local":
         study.tell(Remark("sampling", method=method, points=len(study.points)))
-        by_method = sobol_indices if method == "sobol" else morris_screening
+        by_method = sobol_study if method == "sobol" else morris_study
         outputs = by_method(study, outputs, ~idle, evaluations, seed)
         if not any(s.studied.any() for s in outputs.values()):
             raise BadConfiguration(_no_point_message(study.statuses()))
@@ -222,7 +212,7 @@ def analyse_sensitivity(study: Study, method: str, evaluations: int | None, seed
         correlated=inputs.is_posterior,
         points=study.points,
         outputs=outputs,
-        statuses=studies.statuses,
+        statuses=statuses,
         sampled=study.statuses(),
         evaluations=study.evaluations,
         seconds=round(study.seconds, 3),
@@ -243,31 +233,6 @@ def _describe_inputs(inputs: UncertainInputs, idle: np.ndarray) -> dict[str, Inp
             axis.unit, axis.meaning, kind, float(median[k]), interval, float(sd[k]), bool(idle[k])
         )
     return described
-
-
-def _local_study(row: Quantity, study: Study, found: LocalDerivatives) -> OutputStudy:
-    """Study of an output from its derivatives at the medians."""
-    inputs, name = study.inputs, row.name
-    value, slopes, scores = found.value[name], found.derivative[name], found.by_score[name]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        elasticity = slopes * inputs.values(inputs.centre)[inputs.places] / value[:, None]
-    # A condition's score is uniform in 0..1, with variance 1/12.
-    weight = np.where(inputs.uniform, 1 / 12, 1.0)
-    along = scores @ correlated_directions(inputs).T if inputs.is_posterior else scores
-    variance = np.sum(scores**2 * weight, 1)
-    share = along**2 * weight / np.where(variance > 0, variance, 1.0)[:, None]
-    finite = np.isfinite(value)
-    return OutputStudy(
-        row=row,
-        value=value,
-        derivative=slopes,
-        elasticity=np.where(np.isfinite(elasticity), elasticity, np.nan),
-        swing=found.swing[name],
-        sd=np.where(finite, np.sqrt(variance), np.nan),
-        share=np.where(finite[:, None], share, np.nan),
-        lost=np.zeros(len(value)),
-        studied=finite,
-    )
 
 
 def _no_point_message(statuses: dict[str, dict[str, int]]) -> str:

@@ -42,10 +42,6 @@ class ModelOutputs:
     values: Columns
     statuses: Columns
 
-    def counts(self) -> dict[str, dict[str, int]]:
-        """Source → status → number of points."""
-        return {source: named_counts(np.bincount(codes)) for source, codes in self.statuses.items()}
-
 
 def named_counts(counts: np.ndarray) -> dict[str, int]:
     """Number of points with each status that occurs, from the numbers by code."""

@@ -77,28 +77,17 @@ def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> IntervalEs
 FEWEST = 4
 
 
-@dataclasses.dataclass(frozen=True)
-class SobolDesign:
-    """Points of the unit cube for Sobol indices, grouped by replicates.
-
-    Attributes:
-        points: points, shape (`REPLICATES` · size · blocks, inputs). Blocks follow one another: A, then A with the
-            k-th column of B for each k, then B with the k-th column of A for each k, then B.
-        size: number of base points of a replicate, a power of 2.
-    """
-
-    points: np.ndarray
-    size: int
-
-
 def base_point_count(evaluations: float, inputs: int) -> int:
     """Number of base points of a replicate for at least this many evaluations: a power of 2."""
     blocks = 2 * inputs + 2
     return 2 ** max(math.ceil(math.log2(max(evaluations / (REPLICATES * blocks), FEWEST))), 0)
 
 
-def sobol_design(inputs: int, size: int, seed: int) -> SobolDesign:
-    """Design of independent replicates, each a Sobol sequence with its own scrambling.
+def sobol_design(inputs: int, size: int, seed: int) -> np.ndarray:
+    """Points of the unit cube in independent replicates, each a Sobol sequence with its own scrambling.
+
+    They have the shape (`REPLICATES` · size · blocks, inputs). Blocks follow one another: A, then A with the k-th
+    column of B for each k, then B with the k-th column of A for each k, then B.
 
     Args:
         size: base points of a replicate, a power of 2.
@@ -107,8 +96,7 @@ def sobol_design(inputs: int, size: int, seed: int) -> SobolDesign:
     from SALib.sample import sobol as sampling
 
     generators = np.random.default_rng(seed).spawn(REPLICATES)
-    parts = [sampling.sample(_problem(inputs), size, seed=rng) for rng in generators]
-    return SobolDesign(np.concatenate(parts), size)
+    return np.concatenate([sampling.sample(_problem(inputs), size, seed=rng) for rng in generators])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +129,7 @@ class VarianceTerms:
         return dataclasses.replace(self, first=first, total=total, second=second)
 
 
-def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None:
+def sobol_terms(points: np.ndarray, values: np.ndarray) -> VarianceTerms | None:
     """Parts of the variance of an output.
 
     A base point is omitted if the output is not finite in one of its blocks. If this depends on a single input (such
@@ -149,13 +137,14 @@ def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None
     they are approximate.
 
     Args:
-        values: values of the output at the points of the design.
+        points: points of `sobol_design`.
+        values: values of the output there.
 
     Returns:
         None if some replicate has fewer than two base points left.
     """
-    d = design.points.shape[1]
-    values_by_block = np.reshape(values, (REPLICATES, design.size, 2 * d + 2))
+    d = points.shape[1]
+    values_by_block = np.reshape(values, (REPLICATES, -1, 2 * d + 2))
     finite = np.asarray(np.isfinite(values_by_block).all(-1))
     count = finite.sum(1)
     if count.min() < 2:
@@ -178,22 +167,11 @@ def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class SobolIndices:
-    """Sobol indices of one output, shape (inputs,). `second` has the shape (inputs, inputs). `variance`: [unit²]."""
-
-    first: IntervalEstimate
-    total: IntervalEstimate
-    second: IntervalEstimate
-    variance: float
-
-
-def indices_of_terms(terms: VarianceTerms) -> SobolIndices:
-    """Sobol indices from the parts of the variance."""
-    variance, single = terms.variance, terms.first
-    together = terms.second - single[:, :, None] - single[:, None, :]
-    first, total, second = (ratio_estimate(part, variance) for part in (single, terms.total, together))
-    return SobolIndices(first, total, second, float(variance.mean()))
+def sobol_indices(terms: VarianceTerms) -> dict[str, IntervalEstimate]:
+    """Sobol indices by order: `first` and `total`, shape (inputs,), and `second`, shape (inputs, inputs)."""
+    together = terms.second - terms.first[:, :, None] - terms.first[:, None, :]
+    parts = {"first": terms.first, "total": terms.total, "second": together}
+    return {order: ratio_estimate(part, terms.variance) for order, part in parts.items()}
 
 
 #: Levels of the grid of the trajectories.

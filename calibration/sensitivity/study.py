@@ -16,7 +16,7 @@ from calibration.data import Columns
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.model import Model, ModelOutputs, named_counts
-from calibration.sensitivity.result import OperatingPoints
+from calibration.sensitivity.result import OperatingPoints, OutputStudy
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax import fidelities
 from mmrjax.model.conditions import Conditions
@@ -121,24 +121,6 @@ def source_words(source: str) -> str:
 LOOKS, PLACES = 4, 12
 
 
-@dataclasses.dataclass(frozen=True)
-class LocalDerivatives:
-    """Outputs and derivatives at the medians of the inputs. Arrays of shape (points, inputs), NaN without a value.
-
-    Attributes:
-        value: outputs [SI], shape (points,).
-        derivative: derivative with respect to each input [SI per unit].
-        by_score: derivative with respect to each input's score [SI].
-        swing: output with one input at either end of its 95 % interval [SI], shape (2, points, inputs).
-    """
-
-    value: Columns
-    derivative: Columns
-    by_score: Columns
-    swing: Columns
-    statuses: dict[str, dict[str, int]]
-
-
 def correlated_directions(inputs: UncertainInputs) -> np.ndarray:
     """Directions in score space. Along each, one input moves by one sd and the others follow by their correlation.
 
@@ -158,22 +140,41 @@ def interval_ends(inputs: UncertainInputs) -> Float[np.ndarray, "2 inputs inputs
     return inputs.centre + np.stack([-reach, reach])
 
 
-def local_derivatives(study: Study) -> LocalDerivatives:
-    """Outputs, exact derivatives and swings at each operating point."""
+def local_studies(study: Study) -> tuple[dict[str, OutputStudy], dict[str, dict[str, int]]]:
+    """Study of each output from its exact derivatives at the medians of the inputs, and the number of points with
+    each status, by source.
+    """
     inputs, points, d = study.inputs, len(study.points), len(study.inputs)
     values = study.values_at(np.tile(inputs.centre, (points, 1)))
     answer = study.model(values, study.conditions)
-    by_columns = study.model.derivatives(values, study.conditions)
-    derivative, by_score = {}, {}
-    for name, derivatives in by_columns.items():
-        finite = np.isfinite(answer.values[name])[:, None]
-        derivative[name] = np.where(finite, _derivatives_by_input(inputs, derivatives), np.nan)
-        by_score[name] = np.where(finite, derivatives @ inputs.slope, np.nan)
     spread = jax.tree.map(lambda x: np.repeat(np.asarray(x), d), study.conditions)
     ends = [study.model(study.values_at(np.tile(rows, (points, 1))), spread).values for rows in interval_ends(inputs)]
-    swing = {name: np.stack([end[name].reshape(points, d) for end in ends]) for name in by_columns}
-    statuses = {source_words(source): counts for source, counts in answer.counts().items()}
-    return LocalDerivatives(answer.values, derivative, by_score, swing, statuses)
+    # A condition's score is uniform in 0..1, with variance 1/12.
+    weight = np.where(inputs.uniform, 1 / 12, 1.0)
+    by_columns, outputs = study.model.derivatives(values, study.conditions), {}
+    for row in study.model.outputs:
+        value, derivatives = answer.values[row.name], by_columns[row.name]
+        finite = np.isfinite(value)
+        slopes = np.where(finite[:, None], _derivatives_by_input(inputs, derivatives), np.nan)
+        scores = np.where(finite[:, None], derivatives @ inputs.slope, np.nan)
+        along = scores @ correlated_directions(inputs).T if inputs.is_posterior else scores
+        variance = np.sum(scores**2 * weight, 1)
+        share = along**2 * weight / np.where(variance > 0, variance, 1.0)[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            elasticity = slopes * inputs.values(inputs.centre)[inputs.places] / value[:, None]
+        outputs[row.name] = OutputStudy(
+            row=row,
+            value=value,
+            derivative=slopes,
+            elasticity=np.where(np.isfinite(elasticity), elasticity, np.nan),
+            swing=np.stack([end[row.name].reshape(points, d) for end in ends]),
+            sd=np.where(finite, np.sqrt(variance), np.nan),
+            share=np.where(finite[:, None], share, np.nan),
+            lost=np.zeros(points),
+            studied=finite,
+        )
+    statuses = {source_words(source): named_counts(np.bincount(codes)) for source, codes in answer.statuses.items()}
+    return outputs, statuses
 
 
 def _derivatives_by_input(inputs: UncertainInputs, by_columns: np.ndarray) -> np.ndarray:
@@ -186,14 +187,14 @@ def _derivatives_by_input(inputs: UncertainInputs, by_columns: np.ndarray) -> np
     return by_inputs
 
 
-def inert_inputs(study: Study, found: LocalDerivatives, seed: int) -> np.ndarray:
+def inert_inputs(study: Study, outputs: Mapping[str, OutputStudy], seed: int) -> np.ndarray:
     """True for inputs whose derivatives of all outputs are exactly zero at all tested points, shape (inputs,)."""
     streams = np.random.default_rng(seed).spawn(LOOKS)
     unit = np.concatenate([qmc.Sobol(len(study.inputs), scramble=True, rng=rng).random(1) for rng in streams])
     scores = study.inputs.scores(unit)
     moving = np.zeros(len(study.inputs), bool)
-    for g in found.derivative.values():  # not scores, which mix the parameters of a posterior
-        moving |= (np.nan_to_num(g) != 0).any(0)
+    for output in outputs.values():  # not scores, which mix the parameters of a posterior
+        moving |= (np.nan_to_num(output.derivative) != 0).any(0)
     if moving.all():
         return ~moving
     points = np.unique(np.linspace(0, len(study.points) - 1, PLACES).astype(int))
