@@ -19,7 +19,7 @@ from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs, read_runs
 from calibration.inference.conduct import rows_after_steps
 from calibration.sizing.design_search import SizedDesign, SizingResult
-from calibration.sizing.part_options import drive_options, packaged_cells
+from calibration.sizing.part_options import drive_options, packaged_sheets
 from calibration.sizing.sheet import ParameterChange, RequirementOutcome
 from mmrjax.model import channels
 from mmrjax.model.paper_robots import nominal
@@ -63,7 +63,7 @@ def size():
     robot, drive = nominal(), drive_options(("RE 40 24 V",))[0]
     asked = parse_requirements("mass_kg = 15\n", "aims.toml")
     best = SizedDesign(
-        drive, packaged_cells()[0], 12.5, 0.0414, 3, 4.0, {"mass": 14.14, "energy": 0.031},
+        drive, packaged_sheets("cells")[0], 12.5, 0.0414, 3, 4.0, {"mass": 14.14, "energy": 0.031},
         {"winding": 0.002, "cell current": 0.4}, ("largest ratio",), robot,
     )  # fmt: skip
     short = replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())

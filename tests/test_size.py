@@ -18,8 +18,7 @@ from calibration.sizing.part_options import (
     MOTOR,
     drive_options,
     options_for_robot,
-    packaged_gearboxes,
-    packaged_motors,
+    packaged_sheets,
 )
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
@@ -93,13 +92,13 @@ def test_best_is_of_the_sheets(found):
     for f in (found.best, *found.alternatives):
         made = [
             g.ratio * BELT_STAGE
-            for g in packaged_gearboxes()
+            for g in packaged_sheets("gearboxes")
             if (g.family, g.stages) == (f.drive.family, f.drive.stages)
         ]
         assert f.ratio == pytest.approx(min(made, key=lambda r: abs(r - f.ratio)), rel=1e-12)
         assert f.drive.family in f.drive.motor.gearboxes
         assert f.parallel == pytest.approx(round(f.parallel), abs=1e-9)
-    assert {m.name for m in packaged_motors() if m.gearboxes} == set(found.motors) and found.unmeetable == ()
+    assert {m.name for m in packaged_sheets("motors") if m.gearboxes} == set(found.motors) and found.unmeetable == ()
     assert found.ideal.objectives["mass"] <= found.best.objectives["mass"]
 
 

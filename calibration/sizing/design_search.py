@@ -31,7 +31,7 @@ from calibration.sizing.design import (
     build_sizing_task,
     evaluate_design,
 )
-from calibration.sizing.part_options import CellSheet, DriveOption, PartOptions, options_for_robot
+from calibration.sizing.part_options import DriveOption, PartOptions, Sheet, options_for_robot
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.robot import Robot
 
@@ -76,7 +76,7 @@ class SizedDesign:
         "parallel", "objectives", "feasible", "binds", "margins",
     )  # fmt: skip
     drive: DriveOption
-    cell: CellSheet
+    cell: Sheet
     ratio: float
     radius: float
     in_series: int
@@ -408,7 +408,7 @@ def _sized_design(
         made,
         battery=dataclasses.replace(
             made.battery, cells=series, voltage_cutoff=float(choice.options.cell["cutoff"][choice.cell[row]]),
-            current_limit=parallel * cell.current_max if math.isfinite(cell.current_max) else None,
+            current_limit=parallel * limit if math.isfinite(limit := cell.max_continuous_current) else None,
         ),
         motor=dataclasses.replace(
             made.motor, speed_limit=rated("speed_motor"), temperature_limit=rated("temperature")

@@ -12,7 +12,7 @@ from calibration.described import report_in_words
 from calibration.sizing import sheet
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size_robot as search
-from calibration.sizing.part_options import packaged_motors
+from calibration.sizing.part_options import packaged_sheets
 from calibration.sizing.sheet import RequirementOutcome
 from sweeps import capabilities
 from sweeps import config as configuration
@@ -37,7 +37,7 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
         stated_word(name, OBJECTIVES, "--pareto" if config.pareto else "--objective")
     if config.pareto and len(set(config.pareto)) != 2:
         raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
-    motor_names = [m.name for m in packaged_motors()]
+    motor_names = [m.name for m in packaged_sheets("motors")]
     for name in config.motors:
         stated_word(name, motor_names, "--motors")
     sheet.reject_impossible(robot, requirements)
