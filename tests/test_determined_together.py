@@ -6,7 +6,7 @@ from numpy.random import default_rng
 
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
 from calibration.described import describe
-from calibration.inference.fit_notes import Determination
+from calibration.inference.fit_notes import determination
 from calibration.inference.identifiability import determined_together, undetermined_names
 
 
@@ -38,7 +38,7 @@ def test_the_combination_is_the_one_that_varies_least(correlation, kinds, spread
         alone = np.log(a)
         combined = alone + np.log(b) * {"ratio": -1, "product": 1}[form]
     assert np.std(combined) < 0.2 * np.std(alone)
-    determined = [describe(Determination.from_pairs(n, False, (pair,))) for n in "abc"]
+    determined = [describe(determination(n, False, (pair,))) for n in "abc"]
     assert determined == ["only with b", "only with a", "yes"]
 
 
@@ -46,6 +46,6 @@ def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.94, (LOG, LOG))) == ()
     assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
     pairs = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
-    assert describe(Determination.from_pairs("a", True, pairs)) == "only with b"
-    assert describe(Determination.from_pairs("c", True, pairs)) == "no"
+    assert describe(determination("a", True, pairs)) == "only with b"
+    assert describe(determination("c", True, pairs)) == "no"
     assert undetermined_names(("a", "c"), pairs) == ("c",)

@@ -14,7 +14,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.writing import json_value
 from calibration.inference import identifiability, noise, observers, population, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import ReachedBound, Remark
+from calibration.inference.fit_notes import Remark
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.problem import Observation
 from mmrjax.model import channels, paper_robots
@@ -205,7 +205,11 @@ def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
     assert population.parameters_at_edge(coordinates, np.array([2.4, -2.4, 0.0, 0.0])) == {}
     said = population.parameters_at_edge(coordinates, np.array([2.6, -3.0, 0.0, 9.0]))
     assert list(said) == [NAMES[0], NAMES[1], NAMES[3]]
-    assert [*said.values()] == [ReachedBound("", 2.6), ReachedBound("", -3.0), ReachedBound("upper", 9.0)]
+    assert [*said.values()] == [
+        Remark("edge", bound="", sds=2.6),
+        Remark("edge", bound="", sds=-3.0),
+        Remark("edge", bound="upper", sds=9.0),
+    ]
 
 
 @pytest.mark.slow
@@ -220,11 +224,11 @@ def test_what_members_did_is_counted_and_said(found):
         (),
         None,
         np.nan,
-        {"a": ReachedBound("upper", 9.0)},
+        {"a": Remark("edge", bound="upper", sds=9.0)},
     )
     assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
     assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
-    assert told.remarks()[1:] == [Remark("ended_at_edge", edge={"a": ReachedBound("upper", 9.0)})]
+    assert told.remarks()[1:] == [Remark("ended_at_edge", edge={"a": Remark("edge", bound="upper", sds=9.0)})]
 
 
 @pytest.mark.slow

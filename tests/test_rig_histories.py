@@ -174,7 +174,7 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
         runs = read_table(tmp_path, "\n".join(lines), robot)
         kind = observers.observer_kind(runs)
         known = noise.noise_from_table(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
-        begun = kind.with_initial_states(robot, runs, known)
+        begun = run_grids.measure_initial_states(robot, runs, known)
         assert begun.rig.begins.names == ("begin_",)
         begin = begun.rig.begins.members[0]
         assert begin.motor_speed == pytest.approx(60 * quantities.RPM * 16, rel=1e-9)
@@ -277,7 +277,7 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
 def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path, count):
     robot, runs = imposed_speed(tmp_path, count)
     made = observers.observer_kind(runs).of(
-        runs, observers.observer_kind(runs).with_initial_states(robot, runs, noise.noise_from_table(runs, 1.0))
+        runs, run_grids.measure_initial_states(robot, runs, noise.noise_from_table(runs, 1.0))
     )
     conditions = made.conditions
     assert conditions.motor_speed.shape == conditions.motor_acceleration.shape == made.times.shape

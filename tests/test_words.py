@@ -76,7 +76,11 @@ SAMPLES = [
         ),
     ),
     LOST_MOTION,
-    Remark("ended_at_edge", edge={"a": of_fit.ReachedBound("upper", 9.0), "b": of_fit.ReachedBound("", -2.64)}),
+    Remark("edge", bound="", sds=-2.64),
+    Remark("determined", held=False, others=("a", "b")),
+    Remark(
+        "ended_at_edge", edge={"a": Remark("edge", bound="upper", sds=9.0), "b": Remark("edge", bound="", sds=-2.64)}
+    ),
     Remark(
         "noise_from_series",
         noise=(

@@ -12,6 +12,7 @@ from worlds.settled import remainder
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import bases, noise, observers, ranges
+from calibration.inference.observers import run_grids
 from calibration.inference.observers.run_grids import _common_length
 from calibration.inference.ranges import check_ranges
 from mmrjax.effects import BY_NAME
@@ -34,7 +35,7 @@ def shown(tmp_path, case, terms=()):
         own = {"speed_fade": t.shapes["fade"] * case.rig.w_k} if "fade" in t.shapes else t.shapes
         truth |= {f"effects.{t.name}.{k}": x for k, x in own.items()}
     kind = observers.observer_kind(runs)
-    robot = kind.with_initial_states(robot, runs, noise.noise_from_table(runs, kind.sizes(runs)))
+    robot = run_grids.measure_initial_states(robot, runs, noise.noise_from_table(runs, kind.sizes(runs)))
     made = kind.of(runs, robot)
     names = [c.name for c in robot.channels]
     factors = np.array([c.factor for c in robot.channels])

@@ -337,7 +337,7 @@ def _calibration_result(
     robot = posed.robot(jnp.asarray(z))
     after, before = optimizers.observe_at(posed, jnp.asarray(z)), optimizers.observe_robot(posed, posed.base)
     status, status_before = np.asarray(after.status), np.asarray(before.status)
-    unreachable_rows = multistart.unreachable_rows(posed, status)
+    unreachable_rows = posed.unreachable_rows(status)
     if unreachable_rows.any():
         raise checks.infeasible_error(runs, robot, status, unreachable_rows, ready.names)
     seen_after, seen_before = (

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from calibration.data import Json, Names
+from calibration.data import Json
 from calibration.described import describe
 
 
@@ -68,30 +68,15 @@ class DependentPair(NamedTuple):
         return {"a": self.one, "b": self.other, "correlation": self.correlation, "determined": describe(self)}
 
 
-class Determination(NamedTuple):
-    """Result of the test of whether data determine a parameter.
+def determination(name: str, held: bool, pairs: Iterable[DependentPair]) -> Remark:
+    """Remark on whether data determine a parameter.
 
-    Attributes:
+    Args:
         held: True if only its prior determines it.
-        others: parameters with which it is determined in combination.
+        pairs: all pairs that data determine only in combination.
     """
-
-    held: bool
-    others: Names
-
-    @classmethod
-    def from_pairs(cls, name: str, held: bool, pairs: Iterable[DependentPair]) -> Determination:
-        """Determination of a parameter, given all pairs that data determine only in combination."""
-        return cls(held, tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)))
-
-
-class ReachedBound(NamedTuple):
-    """Bound that a parameter reached, `lower`, `upper` or "", and its distance from the middle of the prior [prior
-    sds].
-    """
-
-    bound: str
-    sds: float
+    others = tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other))
+    return Remark("determined", held=held, others=others)
 
 
 # --- whether a fit is adequate --------------------------------------------------------------------------

@@ -163,11 +163,10 @@ def _separating_columns(
             covariances[channel.column] = np.linalg.inv(rows.T @ rows)
     for first_name, other, _ in alike:
         pair = [about.names.index(first_name), about.names.index(other)]
-        yield tuple(column for column, c in covariances.items() if _are_separable(c[np.ix_(pair, pair)]))
-
-
-def _are_separable(covariance: np.ndarray) -> bool:
-    """True if two parameters are neither correlated nor held by their priors."""
-    sd = np.sqrt(np.diag(covariance))
-    correlation = abs(covariance[0, 1]) / (sd[0] * sd[1])
-    return bool(correlation <= identifiability.CORRELATED and not identifiability.held_by_prior(sd).any())
+        separating = []
+        for column, covariance in covariances.items():
+            sd = np.sqrt(np.diag(covariance)[pair])
+            correlation = abs(covariance[pair[0], pair[1]]) / (sd[0] * sd[1])
+            if correlation <= identifiability.CORRELATED and not identifiability.held_by_prior(sd).any():
+                separating.append(column)
+        yield tuple(separating)

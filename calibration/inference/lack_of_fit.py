@@ -18,12 +18,12 @@ from jaxtyping import Float
 from numpy.polynomial import legendre
 from scipy.special import chdtr, chdtrc, fdtrc, ndtr
 
-from calibration.data import Names
 from calibration.data.clock import course_of_each_row
 from calibration.data.runs import DUTY, Runs
 from calibration.described import describe
 from calibration.inference.fit_notes import AdequacyFinding, Remark
 from calibration.inference.observers import Observer
+from calibration.inference.series_noise import rows_by_key
 from calibration.inference.simulation_errors import share_of_measured
 
 #: Family-wise error of «not adequate».
@@ -293,10 +293,8 @@ def _replicate_test(fit: Residuals) -> list[tuple[float, AdequacyFinding]]:
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes_of(runs), "surface") if runs.has(c)]
-    groups: dict[Names, list[int]] = {}
     past = course_of_each_row(runs).tolist()  # replicates share their past too
-    for row, key in enumerate(zip(past, *(runs[c].astype(str).tolist() for c in columns), strict=True)):
-        groups.setdefault(key, []).append(row)
+    groups = rows_by_key(zip(past, *(runs[c].astype(str).tolist() for c in columns), strict=True))
     pure, degrees = 0.0, 0
     for rows in (g for g in groups.values() if len(g) > 1):
         for k in range(counts.shape[1]):

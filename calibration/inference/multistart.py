@@ -94,11 +94,6 @@ class MultistartResult:
     searched: PopulationSearch | None = None
 
 
-def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
-    """True for rows with readings for which the model has no operating point, shape as `status`."""
-    return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
-
-
 def search_from_starts(posed: Problem, noise: Noise, points: np.ndarray) -> MultistartResult:
     """Searches from all points in one batch. Unknown noise is estimated and the search repeated until the noise
     settles.
@@ -174,7 +169,7 @@ def search_one_by_one(
         for k, point in enumerate(points[1:], 2):
             end, status, _ = step(posed, point[None])
             ends.append(end)
-            feasibles.append(~np.any(unreachable_rows(posed, status), axis=1))
+            feasibles.append(~np.any(posed.unreachable_rows(status), axis=1))
             tell(progress_remark("start", k, len(points), end.cost[0], end.steps[0], elapsed_minutes()))
         optima = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
         k = int(np.nanargmin(optima.cost))
@@ -205,7 +200,7 @@ def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator
         return easy.observation(z).status, steepness(easy.robot(z)) > 1.001 * steepness(easy.base)
 
     status, steep = jax.jit(jax.vmap(status_and_steepness))(jnp.asarray(draws))
-    unreachable_count = unreachable_rows(easy, status).sum(1) + np.asarray(steep).sum(1)
+    unreachable_count = easy.unreachable_rows(status).sum(1) + np.asarray(steep).sum(1)
     return draws[np.argsort(unreachable_count, kind="stable")[:count]]
 
 
@@ -288,7 +283,7 @@ def _search_until_feasible(
     for _ in range(TIGHTENINGS + 1):
         optima, status_start, status_end = search(posed, jnp.asarray(points))
         k = int(np.nanargmin(optima.cost))
-        if not unreachable_rows(posed, status_end)[k].any():
+        if not posed.unreachable_rows(status_end)[k].any():
             break
         posed = posed.with_data(stiffness=posed.data.stiffness / 10)
-    return posed, optima, ~np.any(unreachable_rows(posed, status_start), axis=1)
+    return posed, optima, ~np.any(posed.unreachable_rows(status_start), axis=1)

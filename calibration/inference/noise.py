@@ -196,10 +196,8 @@ def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noi
 def rows_of_same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
     """Rows of each set of equal conditions. A set may have a single row."""
     columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
-    alike: dict[Names, list[int]] = {}
-    for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
-        alike.setdefault(key, []).append(row)
-    return [np.array(rows) for rows in alike.values()]
+    keys = zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)
+    return list(series_noise.rows_by_key(keys).values())
 
 
 def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:

@@ -402,20 +402,18 @@ def _search_with_states(
 
 
 def linearise(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
-    """Residuals (misfit, then priors) at z, their Jacobian, and the observation."""
-    evaluate = linearise_rollout if problem.observe.long else _linearise_by_search_program
-    r, jacobian, observation = evaluate(problem, z)
-    return *clip_penalties(r, jacobian, problem.data), observation
-
-
-def _linearise_by_search_program(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
-    """Result of `linearise`, with the signs of the penalties, by the compiled program of the searches."""
-    data, active = problem.data, getattr(problem.coordinates, "active", None)
-    member = SearchMember(z, data.weight, data.measured, data.centre, active)
-    members = jax.tree.map(lambda x: np.asarray(x)[None], member)
-    _, final_states = _search_with_states(problem, members, 1, problem.observe.searches_per_core(problem))
-    state = jax.tree.map(lambda x: jnp.asarray(x[0]), final_states)
-    return state.residual, state.jacobian, state.aux
+    """Residuals (misfit, then priors) at z, their Jacobian, and the observation, by a program of the searches."""
+    data = problem.data
+    if problem.observe.long:
+        r, jacobian, observation = linearise_rollout(problem, z)
+    else:
+        active = getattr(problem.coordinates, "active", None)
+        member = SearchMember(z, data.weight, data.measured, data.centre, active)
+        members = jax.tree.map(lambda x: np.asarray(x)[None], member)
+        _, final_states = _search_with_states(problem, members, 1, problem.observe.searches_per_core(problem))
+        state = jax.tree.map(lambda x: jnp.asarray(x[0]), final_states)
+        r, jacobian, observation = state.residual, state.jacobian, state.aux
+    return *clip_penalties(r, jacobian, data), observation
 
 
 @functools.partial(compiled, options=SELDOM)

@@ -24,7 +24,7 @@ from calibration.data.writing import entries_of
 from calibration.described import describe
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
-from calibration.inference.fit_notes import ReachedBound, Remark, progress_remark
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
@@ -138,11 +138,6 @@ def _join_observations(parts: list[Observation]) -> Observation:
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-def lost_rows(posed: Problem, seen: Observation) -> Bool[np.ndarray, "members rows"]:
-    """True for measured rows that the model does not reach."""
-    return posed.observe.unreachable(np.asarray(seen.status)) & (np.asarray(posed.data.weight).max(1) > 0)
-
-
 @compiled
 def _observe_points(posed: Problem, points: Float[Array, "points parameters"]) -> Observation:
     return jax.vmap(posed.observation)(points)
@@ -180,7 +175,7 @@ def member_objective(posed: Problem, noise: Noise) -> Objective:
                 squares += 2 * count * np.log(shares[..., k])
             else:
                 squares += np.sum(weight[:, k] * (error[..., k] / sd[:, k]) ** 2, -1)
-        cost = 0.5 * squares + LOST * lost_rows(posed, seen).sum(-1)
+        cost = 0.5 * squares + LOST * posed.unreachable_rows(seen.status).sum(-1)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     return of
@@ -233,7 +228,7 @@ def run_evolution(
         own_cost = cost[-size:]
         finite_cost = np.where(np.isfinite(own_cost), own_cost, MISSING**2)
         search.tell(list(zip(sample, finite_cost.tolist(), strict=True)))
-        failed = int(np.sum(lost_rows(posed, generation).any(-1)))
+        failed = int(np.sum(posed.unreachable_rows(generation.status).any(-1)))
         progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
         tell(progress_remark("generation", number, cost.min(), np.median(own_cost), failed))
         population = Population(z, _join_observations(seen), cost, tuple(progress))
@@ -288,16 +283,14 @@ def unreliable_derivatives(
     return ~np.isfinite(error_norms) | ((error_norms > APART * size) & (error_norms > 1.0))
 
 
-def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, ReachedBound]:
+def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, Remark]:
     """Parameters at a bound, or further than `EDGE` from the middle of their prior, with that distance, by name."""
-    bound = coordinates.beyond(z)
-    at_edge = {}
-    for name, shift, side in zip(coordinates.names, z, bound, strict=True):
-        if side:
-            at_edge[name] = ReachedBound("lower" if side < 0 else "upper", float(shift))
-        elif abs(shift) > EDGE:
-            at_edge[name] = ReachedBound("", float(shift))
-    return at_edge
+    bounds = [{-1: "lower", 0: "", 1: "upper"}[int(side)] for side in coordinates.beyond(z)]
+    return {
+        name: Remark("edge", bound=bound, sds=float(shift))
+        for name, shift, bound in zip(coordinates.names, z, bounds, strict=True)
+        if bound or abs(shift) > EDGE
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -319,7 +312,7 @@ class PopulationSearch:
     apart: Names
     slope: np.ndarray | None
     left: float
-    edge: dict[str, ReachedBound] = dataclasses.field(default_factory=dict)
+    edge: dict[str, Remark] = dataclasses.field(default_factory=dict)
 
     def to_json(self) -> Json:
         """Entries of result.json."""

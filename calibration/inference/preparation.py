@@ -18,6 +18,7 @@ from calibration.inference import checks, observers
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Notes, Remark
 from calibration.inference.noise import Noise
+from calibration.inference.observers import run_grids
 from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.simulation import check_robot
@@ -131,7 +132,7 @@ def prepare_input(
     robot = inferred_facts.with_table_mass(robot, runs)
     noise_sds = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
     noise_sds, larger = noise_room.enlarge_noise(noise_sds, runs)
-    robot = observe.with_initial_states(robot, runs, noise_sds)
+    robot = run_grids.measure_initial_states(robot, runs, noise_sds)
     result = PreparedInput(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
     names = tuple(choose(result))
     # The table's masses are compared with those of the file, which are not yet replaced there.

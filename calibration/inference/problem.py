@@ -162,6 +162,10 @@ class Problem(eqx.Module):
         by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), residual_slope)
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
 
+    def unreachable_rows(self, status: Any) -> np.ndarray:
+        """True for rows with readings for which the model has no operating point, shape as `status`."""
+        return self.observe.unreachable(np.asarray(status)) & (np.asarray(self.data.weight).max(1) > 0)
+
     def adhesion_excess(self, seen: Observation) -> Float[Array, " rows"]:
         """Used adhesion above the margin, in units of the penalty, shape (rows,). Negative within the margin."""
         excess = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(self.data.weight, 1) / self.data.stiffness

@@ -16,6 +16,7 @@ from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.inference import observers
 from calibration.inference.fit_notes import Remark
+from calibration.inference.series_noise import rows_by_key
 from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
@@ -252,10 +253,9 @@ def _slope_unit_remark(runs: Runs, measured: np.ndarray, possible: np.ndarray, r
     columns = [
         c for c in ("configuration", runs.layout.imposed_column, "payload_kg", "surface", "duty") if runs.has(c)
     ]
-    groups: dict[Names, list[int]] = {}
-    for row in np.flatnonzero(finite):
-        groups.setdefault(tuple(str(runs[c][row]) for c in columns), []).append(int(row))
-    several = [g for g in groups.values() if np.ptp(slope[g]) > 0]
+    rows_finite = np.flatnonzero(finite)
+    groups = rows_by_key(tuple(str(runs[c][row]) for c in columns) for row in rows_finite)
+    several = [rows_finite[g] for g in groups.values() if np.ptp(slope[rows_finite[g]]) > 0]
     if sum(len(g) - 1 for g in several) < 3:
         return
     x, y = (np.concatenate([v[g, k] - np.mean(v[g, k]) for g in several]) for v in (possible, measured))

@@ -13,7 +13,7 @@ from calibration.data import Columns, Json, Names, writing
 from calibration.data import posterior_file as posterior
 from calibration.data.posterior_file import Posterior
 from calibration.described import describe, sentences
-from calibration.inference.fit_notes import DependentPair, Determination, Notes, Remark
+from calibration.inference.fit_notes import DependentPair, Notes, Remark, determination
 from calibration.inference.identifiability import Identifiability, determined_together, undetermined_names
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import StartOutcomes
@@ -319,7 +319,7 @@ class CalibrationResult:
         """Determination of a parameter by the data: `yes`, `no`, or the parameters with which only a combination is
         determined.
         """
-        return describe(Determination.from_pairs(name, self.parameters[name].held_by_prior, self.together))
+        return describe(determination(name, self.parameters[name].held_by_prior, self.together))
 
     @property
     def counts(self) -> dict[str, int]:

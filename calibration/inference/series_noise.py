@@ -10,6 +10,8 @@ Jennen-Steinmetz, Biometrika 73 (1986), for any spacing).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Hashable, Iterable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -94,6 +96,14 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
     return tuple(noises)
 
 
+def rows_by_key(keys: Iterable[Hashable]) -> dict[Any, np.ndarray]:
+    """Rows with each key, from the key of each row."""
+    together: dict[Any, list[int]] = {}
+    for row, key in enumerate(keys):
+        together.setdefault(key, []).append(row)
+    return {key: np.array(rows) for key, rows in together.items()}
+
+
 def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
     """Rows of each series along an axis, at least three. Backward travel is a separate series.
 
@@ -102,16 +112,14 @@ def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
     other_columns = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
     level = {c: voltage_levels(runs[c]) if c == SUPPLY else runs[c] for c in other_columns}
     driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]
-    keys: list[tuple] = [
+    keys = (
         (*(str(level[c][row]) for c in other_columns), *(float(np.sign(runs[c][row])) for c in driving))
         for row in range(len(runs))
-    ]
-    together: dict[tuple, list[int]] = {}
-    for row, key in enumerate(keys):
-        together.setdefault(key, []).append(row)
+    )
+    together = list(rows_by_key(keys).values())
     if runs.has("mode"):
-        together = {k: rows for k, rows in together.items() if runs["mode"][rows[0]] == DRIVEN[0]}
-    return [np.array(rows) for rows in together.values() if len(rows) > 2]
+        together = [rows for rows in together if runs["mode"][rows[0]] == DRIVEN[0]]
+    return [rows for rows in together if len(rows) > 2]
 
 
 def voltage_levels(voltage: np.ndarray) -> np.ndarray:

@@ -63,11 +63,11 @@ def determined_combination(two: fit_notes.DependentPair) -> str:
     return f"{two.one} {'-' if two.weight < 0 else '+'} {abs(two.weight):.2g} · {two.other}"
 
 
-def is_determined_answer(found: fit_notes.Determination) -> str:
+def is_determined_answer(held: bool, others: tuple[str, ...]) -> str:
     """Answer whether data determine a parameter: `yes`, `no`, or `only with motor.resistance` for both of a pair."""
-    if found.others:
-        return f"only with {', '.join(found.others)}"
-    return "no" if found.held else "yes"
+    if others:
+        return f"only with {', '.join(others)}"
+    return "no" if held else "yes"
 
 
 def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
@@ -107,11 +107,11 @@ def search_generations(members: int, generations: int, settled: bool) -> str:
     return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}. {end}"
 
 
-def distance_from_prior(at: fit_notes.ReachedBound) -> str:
-    """Bound of a parameter, or its distance from the middle of its prior."""
-    if at.bound:
-        return f"at its {at.bound} bound"
-    return f"{abs(at.sds):.1f} prior sd {'below' if at.sds < 0 else 'above'} its prior's mean"
+def distance_from_prior(bound: str, sds: float) -> str:
+    """Bound of a parameter, or its distance from the middle of its prior [prior sds]."""
+    if bound:
+        return f"at its {bound} bound"
+    return f"{abs(sds):.1f} prior sd {'below' if sds < 0 else 'above'} its prior's mean"
 
 
 # --- what residuals show --------------------------------------------------------------------------------
@@ -362,8 +362,10 @@ SAID: dict[str, str | Callable[..., str]] = {
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",
     "in_pieces": "{name} has a 95 % interval of {pieces} parts",
     "generations": search_generations,
+    "determined": is_determined_answer,
+    "edge": distance_from_prior,
     "ended_at_edge": lambda edge: (
         "the search ended at the edge of its range, with "
-        + ", ".join(f"{name} {distance_from_prior(at)}" for name, at in edge.items())
+        + ", ".join(f"{name} {distance_from_prior(**at.values)}" for name, at in edge.items())
     ),
 }

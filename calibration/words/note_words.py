@@ -29,8 +29,6 @@ NOTES: dict[str, str | Callable[..., str]] = {
 #: Kind of result, or part of one → the function that makes its sentence.
 RESULTS: dict[type, Callable[..., str]] = {
     Feedforward: fit_words.feedforward_statement,
-    fit_notes.Determination: fit_words.is_determined_answer,
-    fit_notes.ReachedBound: fit_words.distance_from_prior,
     fit_notes.DependentPair: fit_words.determined_combination,
     fit_notes.AdequacyFinding: fit_words.adequacy_finding_in_words,
     Adequacy: fit_words.adequacy_verdict,

@@ -21,7 +21,7 @@ from calibration.data.runs import Runs
 from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, is_example
 from calibration.described import as_paragraph, describe, sentences
 from calibration.inference import foresight, identifiability, priors
-from calibration.inference.fit_notes import Determination
+from calibration.inference.fit_notes import determination
 from calibration.inference.foresight import InformationForecast, ParameterInformation
 from calibration.inference.identifiability import undetermined_names
 from calibration.words import fit_words
@@ -207,7 +207,7 @@ class RigCheck:
     def determined(self, parameter: ParameterInformation) -> str:
         """`yes`, `no`, or the parameters with which the table determines this one in combination."""
         assert self.foresight is not None
-        return describe(Determination.from_pairs(parameter.name, parameter.held, self.foresight.together))
+        return describe(determination(parameter.name, parameter.held, self.foresight.together))
 
     def to_json(self) -> Json:
         """The whole check as JSON-able data."""

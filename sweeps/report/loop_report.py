@@ -15,7 +15,7 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.details import TimeStatistics
-from calibration.inference.fit_notes import Determination, remarks_with_codes
+from calibration.inference.fit_notes import determination, remarks_with_codes
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
 from mmrjax.errors import count_noun
@@ -270,7 +270,7 @@ def _sections(
         (
             f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
             fit_tables.shift_cell(p.shift_after),
-            describe(Determination.from_pairs(name, p.held_by_prior, found.together)),
+            describe(determination(name, p.held_by_prior, found.together)),
             p.at_bound or "", p.meaning,
         )
         for name, p in found.base_shift.items()

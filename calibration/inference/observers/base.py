@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
@@ -20,8 +21,17 @@ from calibration.inference.details import Detail
 from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
-from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot, search_rollouts
+from calibration.inference.optimizers import (
+    CORES,
+    Evaluate,
+    Numbers,
+    Optimum,
+    linearise,
+    observe_robot,
+    search_rollouts,
+)
 from calibration.inference.problem import Observation, Problem
+from mmrjax.compile.compiling import Threads
 from mmrjax.effects import Effect
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
@@ -131,11 +141,6 @@ class Observer(eqx.Module):
             BadData: a run does not begin in an initial state of the model.
         """
         return []
-
-    @classmethod
-    def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
-        """Robot with the initial states of runs that do not begin at rest. Unchanged for settled runs."""
-        return robot
 
     @classmethod
     def check_settled(cls, runs: Runs) -> None:
@@ -336,15 +341,7 @@ class Observer(eqx.Module):
             rivals: True if all members search the same optimum, so that some may be stopped early.
             most: largest number of steps. None: that of the policy.
         """
-
-        def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-            parts = []
-            for point, member in zip(z, members, strict=True):
-                member_problem = problem.with_data(weight=jnp.asarray(weights[member]))
-                parts.append(self.at(member_problem, point, None if active is None else active[member]))
-            return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
-
-        steps = self.policy.steps if most is None else most
+        evaluate, steps = parallel_evaluator(problem, weights, active), self.policy.steps if most is None else most
         return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
@@ -387,3 +384,24 @@ def with_effects(problem: Problem, active: Numbers | None) -> Problem:
     if active is None:
         return problem
     return dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(jnp.asarray(active)))
+
+
+def parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Evaluate:
+    """Function that evaluates the model for members of a search, in parallel.
+
+    Args:
+        weights, active: values for each member, see `Observer.search`.
+    """
+    weights, made = np.asarray(weights), threading.Event()
+
+    def evaluate_one(z: np.ndarray, member: int) -> tuple[Numbers, Numbers, Observation]:
+        slots = None if active is None else np.asarray(active)[member]
+        return jax.device_get(problem.observe.at(problem.with_data(weight=weights[member]), z, slots))
+
+    def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+        with Threads(CORES if made.is_set() else 1) as cores:
+            results = list(cores.map(evaluate_one, z, members))
+        made.set()  # the first call has compiled the program
+        return jax.tree.map(lambda *x: np.stack(x), *results)
+
+    return evaluate

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import threading
 import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar, Self
@@ -31,13 +30,13 @@ from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect
 from calibration.inference.noise import Noise
 from calibration.inference.observers import run_changes, run_grids, settled_ends
-from calibration.inference.observers.base import Observer, SearchPolicy, with_effects
+from calibration.inference.observers.base import Observer, SearchPolicy, parallel_evaluator, with_effects
 from calibration.inference.optimizers import Numbers, Optimum
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Observation, Problem
 from calibration.inference.weak_form import fit_weak_form
 from mmrjax import fidelities
-from mmrjax.compile.compiling import OVER_TIME, SELDOM, Threads, compiled
+from mmrjax.compile.compiling import OVER_TIME, SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities import histories
@@ -263,10 +262,6 @@ class Histories(Observer):
                 Remark("stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in undriven)))
             )
         return remarks
-
-    @classmethod
-    def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
-        return run_grids.measure_initial_states(robot, runs, noise)
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
@@ -533,7 +528,7 @@ class Histories(Observer):
 
         def search_batch(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
             weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
-            evaluate = _parallel_evaluator(blunt, weights, None)
+            evaluate = parallel_evaluator(blunt, weights, None)
             # The best parameters of each configuration are combined, so a search may be the best of one only.
             within = NEAR if len(blunt.base.configurations) == 1 else np.inf
             return optimizers.search_rollouts(
@@ -601,7 +596,7 @@ class Histories(Observer):
 
         def search_from(starts: Numbers, members: slice = slice(None)) -> tuple[Optimum, Observation]:
             weight = np.asarray(weights)[members]
-            evaluate = _parallel_evaluator(problem, weight, None if active is None else np.asarray(active)[members])
+            evaluate = parallel_evaluator(problem, weight, None if active is None else np.asarray(active)[members])
             return optimizers.search_rollouts(
                 evaluate, starts, problem.data, weight, steps, self.policy.batch, within=within
             )
@@ -687,10 +682,6 @@ class Histories(Observer):
         return details.TimeStatistics(
             self.rows_of.shape[0], samples, unresolved, statistics_of_fit(before), statistics_of_fit(after)
         )
-
-
-#: Largest number of first samples that determine a run's initial state.
-FIRST_SAMPLES = 5
 
 
 def _merge_levels(x: np.ndarray) -> np.ndarray:
@@ -800,27 +791,6 @@ def _minimum_with_one_held(residual: Array, jacobian: Array, z: Array, held: Arr
     free = jnp.where(held, 0.0, jacobian)
     step = -solve(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
     return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
-
-
-def _parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> optimizers.Evaluate:
-    """Function that evaluates the model for members of a search, in parallel.
-
-    Args:
-        weights, active: values for each member, see `Histories.search`.
-    """
-    weights, made = np.asarray(weights), threading.Event()
-
-    def evaluate_one(z: np.ndarray, member: int) -> tuple[np.ndarray, np.ndarray, Observation]:
-        slots = None if active is None else np.asarray(active)[member]
-        return _evaluate_at(with_effects(problem.with_data(weight=weights[member]), slots), z)[:3]
-
-    def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-        with Threads(optimizers.CORES if made.is_set() else 1) as cores:
-            results = list(cores.map(evaluate_one, z, members))
-        made.set()  # the first call has compiled the program
-        return jax.tree.map(lambda *x: np.stack(x), *results)
-
-    return evaluate
 
 
 @functools.partial(compiled, options=OVER_TIME)
