@@ -24,7 +24,7 @@ from calibration.discovery.projection import Projection
 from calibration.discovery.settings import settings_for
 from calibration.inference import weak_form
 from calibration.inference.bases import family_names
-from calibration.inference.observers import Histories, windows
+from calibration.inference.observers import Histories, linear_rows
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
 from tests.commands import motor_on_bench
@@ -127,7 +127,7 @@ def answered(tmp_path_factory):
         return (
             space,
             fit,
-            *windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width),
+            *linear_rows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width),
         )
 
     of.windows_of, of.input_of = windows_of, input_of
@@ -165,7 +165,7 @@ def test_a_held_voltage_that_swings_a_row_late_biases_nothing(answered):
     for name, truth in (("rig.delay", EVERY), ("motor.resistance", 0.9)):
         k = coordinates.names.index(name)
         assert abs(value[k] - truth) < 3 * max(sds[k], 0.002 * truth) and sd[k] < 0.5
-    assert abs(np.sum(fit.residual**2) - fit.windows) < 5 * np.sqrt(2 * fit.windows)
+    assert abs(np.sum(fit.residual**2) - len(fit.signatures)) < 5 * np.sqrt(2 * len(fit.signatures))
 
 
 def test_windows_fit_effects_as_least_squares_do(answered):

@@ -126,7 +126,7 @@ def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
         ), None
 
     monkeypatch.setattr(time_histories.optimizers, "search_rollouts", ended)
-    monkeypatch.setattr(time_histories, "_parallel_evaluator", lambda *_: None)
+    monkeypatch.setattr(time_histories, "parallel_evaluator", lambda *_: None)
     observer = SimpleNamespace(policy=SimpleNamespace(steps=30, batch=8))
     search = functools.partial(time_histories.Histories.search, observer, SimpleNamespace(data=None))
     found, _ = search(np.zeros((3, 2)), np.ones(3))

@@ -114,7 +114,7 @@ def test_noise_of_windows_is_that_of_their_readings(space, before):
     quiet = Runs("synthetic", motor(seed=5, quadratic=0.0)).of(space.bare.base)
     found = weak_form.fit_weak_form(posed(quiet, space.bare.base).bare)
     chi2 = np.sum(found.residual**2)
-    assert abs(chi2 - found.windows) < 4 * np.sqrt(2 * found.windows)
+    assert abs(chi2 - len(found.signatures)) < 4 * np.sqrt(2 * len(found.signatures))
 
 
 def test_noise_that_windows_and_equations_share_is_correlated(space, before):

@@ -31,7 +31,6 @@ from calibration.inference.fit_notes import AdequacyFinding, Remark, progress_re
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
-from calibration.inference.shown_states import MissingStates
 from calibration.words import experiment_words, fit_words, loop_words, step_words, table_words
 from calibration.words.note_words import NOTES
 from mmrjax.model import channels
@@ -88,7 +87,7 @@ SAMPLES = [
             SeriesNoise(channels.find_channel("speed"), 0.0, 0.0124, 7.44, "slope_deg", 4, 0.004),
         ),
     ),
-    *(Remark("unshown", source="log.csv", why=why.value) for why in MissingStates),
+    *(Remark("unshown", source="log.csv", why=why) for why in loop_words.UNSHOWN),
     Remark("run_differs", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, changed="motor.inertia", root_changed=11.2)),
     Remark("run_differs", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, changed="track", root_changed=11.2)),
     Remark(

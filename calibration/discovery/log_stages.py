@@ -24,8 +24,7 @@ from calibration.discovery.verdict import LoopStages
 from calibration.inference import observers
 from calibration.inference.fit_notes import progress_remark
 from calibration.inference.noise import Noise
-from calibration.inference.observers.linear_rows import problem_of_readings
-from calibration.inference.observers.windows import Windows, problem_of_windows
+from calibration.inference.observers.linear_rows import Windows, problem_of_readings, problem_of_windows
 from calibration.inference.priors import DELAY
 from calibration.inference.weak_form import fit_weak_form
 

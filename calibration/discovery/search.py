@@ -247,4 +247,4 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormSc
     optimum = with_slots(Optimum(*of_fit), space, settings)
     base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), optimum, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
-    return WeakFormScreening(base, slides, scores, equations.windows, null)
+    return WeakFormScreening(base, slides, scores, len(equations.signatures), null)

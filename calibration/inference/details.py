@@ -6,6 +6,7 @@ import abc
 import dataclasses
 
 from calibration.data import Columns, Json, Names
+from calibration.data.writing import entries_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,21 +47,6 @@ class EquationErrors(Detail):
 
 
 @dataclasses.dataclass(frozen=True)
-class ResidualMemory:
-    """Autocorrelation of the residuals: the Ljung-Box statistic as a normal deviate, with its critical value and
-    p-value.
-
-    These come from bootstrap tables. `autocorrelation`: of each channel, at lags 1 to `lags`.
-    """
-
-    deviate: float
-    threshold: float
-    p: float
-    lags: int
-    autocorrelation: dict[str, list[float]]
-
-
-@dataclasses.dataclass(frozen=True)
 class StrongestWave:
     """Balance in which a wave or a drift explains most of the misfit, with its score (normal deviate) and decrease of
     χ² [σ²].
@@ -73,20 +59,33 @@ class StrongestWave:
 
 @dataclasses.dataclass(frozen=True)
 class FitOverTime:
-    """Statistics of one fit over time: memory of the residuals, waves and drift.
+    """Statistics of one fit over time: autocorrelation of the residuals, waves and drift.
 
-    `orders`: (name, periods per turn of the driving shaft) → score. There is no drift if the other conditions
-    determine the time (see `bases.COLLINEAR`).
+    Attributes:
+        deviate, threshold, p: Ljung-Box statistic as a normal deviate, with its critical value and p-value from
+            bootstrap tables.
+        autocorrelation: autocorrelation of each channel, at lags from 1.
+        orders: (name, periods per turn of the driving shaft) → score.
+        drift: None if the other conditions determine the time (see `bases.COLLINEAR`).
     """
 
-    memory: ResidualMemory
+    deviate: float
+    threshold: float
+    p: float
+    autocorrelation: dict[str, list[float]]
     orders: dict[tuple[str, float], StrongestWave]
     drift: StrongestWave | None
+
+    @property
+    def lags(self) -> int:
+        """Number of lags of the autocorrelation."""
+        return len(next(iter(self.autocorrelation.values())))
 
     def to_json(self) -> Json:
         """Entries of `result.json`."""
         orders = [{"order": w, "a_turn": n, **vars(s)} for (w, n), s in self.orders.items()]
-        return {"memory": self.memory, "orders": orders, "drift": self.drift}
+        memory = entries_of(self, "deviate", "threshold", "p", "lags", "autocorrelation")
+        return {"memory": memory, "orders": orders, "drift": self.drift}
 
 
 @dataclasses.dataclass(frozen=True)

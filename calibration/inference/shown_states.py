@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import operator
 from collections.abc import Mapping
-from enum import StrEnum
 from typing import Any
 
 import equinox as eqx
@@ -48,17 +47,6 @@ REACH = 2.0
 EDGE = 1e-4
 #: Fields of `Conditions` with a mean over an interval; others are those at its middle.
 IMPOSED = "voltage", "duty", "motor_current", "motor_speed", "motor_acceleration", "load_torque"
-
-
-class MissingStates(StrEnum):
-    """Reason why a log does not show the states of its equations."""
-
-    MOTION = "motion"  # no speed or angle
-    SIGN = "sign"  # an instrument shows only a magnitude
-    SLACK = "slack"  # backlash: motor and load move apart
-    TURN = "turn"  # of a robot that turns
-    GOAL = "goal"  # a controller gives the voltage
-    FOLLOWER = "follower"  # a speed is imposed, and no channel follows it
 
 
 class StatePlan(eqx.Module):
@@ -100,23 +88,21 @@ def state_plan(problem: Problem) -> StatePlan | None:
     return plan if isinstance(plan, StatePlan) else None
 
 
-def state_plan_or_reason(
-    robot: Robot, channels_read: Mapping[int, Channel], pulsed: bool = False
-) -> StatePlan | MissingStates:
-    """State plan of a log, or the reason why it has no plan.
+def state_plan_or_reason(robot: Robot, channels_read: Mapping[int, Channel], pulsed: bool = False) -> StatePlan | str:
+    """State plan of a log, or the reason why it has no plan, a key of `loop_words.UNSHOWN`.
 
     Args:
         channels_read: channels with readings, by index.
         pulsed: True if the duty changes.
     """
     if robot.rig.turns:
-        return MissingStates.TURN
+        return "turn"
     if robot.rig.follows_goal:
-        return MissingStates.GOAL
+        return "goal"
     if robot.loose:
-        return MissingStates.SLACK
+        return "slack"
     if {c.name for c in channels_read.values()} & robot.rig.magnitudes:
-        return MissingStates.SIGN
+        return "sign"
     imposed = robot.rig.imposed
     current_channel = "total_current"  # proportional to the duty of pulses
     currents = {k: c.name == current_channel for k, c in channels_read.items() if c.rests_on == CURRENT}
@@ -125,11 +111,11 @@ def state_plan_or_reason(
     angles = [k for k, c in channels_read.items() if c.zero_at_rest and not c.settled]
     if imposed == "motor_speed":
         others = (*currents, *voltages)
-        return StatePlan(-1, -1, False, False, others, imposed) if others else MissingStates.FOLLOWER
+        return StatePlan(-1, -1, False, False, others, imposed) if others else "follower"
     current = next(iter(sorted(currents, key=lambda k: currents[k])), -1) if imposed == "voltage" else -1
     current = -1 if current >= 0 and pulsed and currents[current] else current
     if not (speeds or angles):
-        return MissingStates.MOTION
+        return "motion"
     motion = (*speeds, *angles)[0]
     slips = [
         k
@@ -593,4 +579,4 @@ def missing_states_remarks(runs: Runs, robot: Robot) -> list[Remark]:
     """Remark on a log that does not show the states of its equations."""
     read = {k: c for k, c in enumerate(runs.channels) if runs.sampled and np.isfinite(runs.measured()[:, k]).any()}
     plan = state_plan_or_reason(robot, read) if read else None
-    return [Remark("unshown", source=runs.source, why=plan.value)] if isinstance(plan, MissingStates) else []
+    return [Remark("unshown", source=runs.source, why=plan)] if isinstance(plan, str) else []

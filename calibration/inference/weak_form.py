@@ -499,7 +499,6 @@ class WeakFormFit:
         residual: residuals of windows, then z - centre, shape (windows + coordinates,).
         jacobian: derivatives with respect to the coordinates.
         signatures: derivatives of the windows with respect to the amplitude of each instance [prior sd].
-        windows: number of equations, one or more for each window.
         plan, cut: channels that give the states, and the windows.
         centre, origin: prior mean, and coordinates of the terms.
         rows: points with states without noise.
@@ -511,7 +510,6 @@ class WeakFormFit:
     residual: np.ndarray
     jacobian: np.ndarray
     signatures: np.ndarray
-    windows: int
     plan: StatePlan
     cut: list[RunWindows]
     centre: np.ndarray
@@ -596,8 +594,7 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
         signatures = whiten(factors, by_effects)
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
-    about_fit = residuals[:, 0], residuals[:, 1:], signatures, len(signatures)
-    return WeakFormFit(z, *about_fit, plan, cut, centre, origin, *states)
+    return WeakFormFit(z, residuals[:, 0], residuals[:, 1:], signatures, plan, cut, centre, origin, *states)
 
 
 def _window_factors(

@@ -40,11 +40,8 @@ OBJECTIVES = {
 }
 #: Requirements on continuous travel, at whose points the ratings of the parts apply.
 LASTING = tuple(q.column for q in QUANTITIES.values() if q.group in ("travel", "payload"))
-#: Ratings of parts: name and description.
-RATED = {
-    "winding": "winding", "motor_speed": "motor speed", "gearbox_speed": "gearbox input speed",
-    "gearbox_torque": "gearbox torque", "cell_current": "cell current",
-}  # fmt: skip
+#: Ratings of parts.
+RATED = ("winding", "motor speed", "gearbox input speed", "gearbox torque", "cell current")
 
 
 class Design(eqx.Module):
@@ -86,20 +83,6 @@ def build_robot(robot: Robot, base_mass: float, configuration: str, design: Desi
     return params.replace(robot, values), rated
 
 
-@dataclasses.dataclass(frozen=True)
-class SizingDemand:
-    """One requirement with its evaluation points.
-
-    Attributes:
-        requirement: requirement. None: the ratings of the parts.
-        rows: indices of its points.
-    """
-
-    requirement: Requirement | None
-    label: str
-    rows: tuple[int, ...]
-
-
 class SizingTask(eqx.Module):
     """Requirements as points and demands. For each design, the balances are solved once per point.
 
@@ -109,7 +92,8 @@ class SizingTask(eqx.Module):
         base_mass: mass of the initial parts in the robot's mass [kg].
         points: evaluation points, shape (points,).
         middle: index of the point in the middle of the envelope, at which energy is evaluated.
-        demands: demands in order.
+        demands: requirements, each with the indices of its points.
+        travelling: indices of the points at which the ratings of the parts apply.
     """
 
     robot: Robot
@@ -117,12 +101,13 @@ class SizingTask(eqx.Module):
     base_mass: float = eqx.field(static=True)
     points: EnvelopePoint
     middle: int = eqx.field(static=True)
-    demands: tuple[SizingDemand, ...] = eqx.field(static=True)
+    demands: tuple[tuple[Requirement, tuple[int, ...]], ...] = eqx.field(static=True)
+    travelling: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def labels(self) -> Names:
         """Label of each margin of `evaluate_design`."""
-        return tuple(d.label for d in self.demands)
+        return (*(requirement_label(r) for r, _ in self.demands), *RATED)
 
 
 def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -> SizingTask:
@@ -147,9 +132,7 @@ def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -
     for r in asked.each:
         envelope = sheet.envelope_points(robot, r)
         rows = [tuple(row(p) for p in corner) for corner in _envelope_corners(robot, r, envelope)]
-        demands.append(
-            SizingDemand(r, requirement_label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner))
-        )
+        demands.append((r, tuple(k for corner in dict.fromkeys(rows) for k in corner)))
     e = asked.envelope
     middle_demand = Requirement("speed_m_s", 0.0, True, dataclasses.replace(
         e, payload_kg=(sum(e.payload_kg) / 2,) * 2, slope_deg=(sum(e.slope_deg) / 2,) * 2,
@@ -157,13 +140,12 @@ def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -
         supply_voltage_V=None if e.supply_voltage_V is None else (sum(e.supply_voltage_V) / 2,) * 2,
     ))  # fmt: skip
     middle = row(jax.tree.map(lambda x: x[0], sheet.envelope_points(robot, middle_demand)))
-    travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
-    demands += [SizingDemand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
+    travelling = tuple(sorted({k for r, rows in demands if r.name in LASTING for k in rows})) or (middle,)
     points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *envelope_points)
     one_cell = params.without_weak_types(
         dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1))
     )
-    return SizingTask(one_cell, name, options.base_mass, points, middle, tuple(demands))
+    return SizingTask(one_cell, name, options.base_mass, points, middle, tuple(demands), travelling)
 
 
 def requirement_label(r: Requirement) -> str:
@@ -209,30 +191,34 @@ def evaluate_design(asked: SizingTask, design: Design) -> tuple[Array, Array]:
     states = jax.vmap(lambda p: travel_quantities(robot, p, ratings)[0])(asked.points)
     mass = jnp.asarray(robot.configurations[asked.configuration].mass)
     energy = states["energy_per_metre_Wh"][asked.middle] / 3600.0
-    margins = [_demand_margin(asked, d, design, robot, ratings, states) for d in asked.demands]
+
+    def at_points(rows: tuple[int, ...]) -> tuple[EnvelopePoint, dict[str, Array]]:
+        return jax.tree.map(lambda x: x[np.array(rows, int)], (asked.points, states))
+
+    margins = [_demand_margin(asked, r, robot, ratings, *at_points(rows)) for r, rows in asked.demands]
+    margins += _rating_margins(design, robot, *at_points(asked.travelling))
     objectives = jnp.stack([mass, energy, jnp.asarray(design.drive["cost"])])
     return objectives, jnp.stack(margins)
 
 
+def _rating_margins(design: Design, robot: Robot, points: EnvelopePoint, states: Mapping[str, Array]) -> list[Array]:
+    """Margins to the ratings of the parts, as in `RATED`."""
+    battery = jnp.max(jnp.where(points.battery > 0.5, states["battery"], 0.0))
+    return [
+        jnp.min(_heat_margins(robot, points, states["current"], design.drive["temperature"])),
+        1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_motor"],
+        1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_gearbox"],
+        1 - jnp.max(states["gearbox_Nm"]) / design.drive["torque"],
+        1 - battery / (jnp.exp(design.continuous[..., 2]) * design.cell["current"]),
+    ]
+
+
 def _demand_margin(
-    asked: SizingTask, d: SizingDemand, design: Design, robot: Robot, ratings: Ratings, found: Mapping[str, Array]
-) -> Array:
-    rows = np.array(d.rows, int)
-    states = {key: x[rows] for key, x in found.items()}
-    points = jax.tree.map(lambda x: x[rows], asked.points)
+    asked: SizingTask, r: Requirement, robot: Robot, ratings: Ratings, points: EnvelopePoint,
+    states: Mapping[str, Array],
+) -> Array:  # fmt: skip
     travels = jnp.min(jnp.minimum(states["left"], 1.0))
     cell_voltage_ratio = jnp.min(jnp.minimum(states["cell"] / ratings.voltage_cutoff, 1.0))
-    r = d.requirement
-    if r is None:
-        most = {
-            "winding": jnp.min(_heat_margins(robot, points, states["current"], design.drive["temperature"])),
-            "motor_speed": 1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_motor"],
-            "gearbox_speed": 1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_gearbox"],
-            "gearbox_torque": 1 - jnp.max(states["gearbox_Nm"]) / design.drive["torque"],
-            "cell_current": 1 - jnp.max(jnp.where(points.battery > 0.5, states["battery"], 0.0))
-            / (jnp.exp(design.continuous[..., 2]) * design.cell["current"]),
-        }  # fmt: skip
-        return most[next(key for key, words in RATED.items() if words == d.label)]
     if r.name == "mass_kg":
         share = 1 - jnp.asarray(robot.configurations[asked.configuration].mass) / _positive_limit(r)
         return -share if r.least else share

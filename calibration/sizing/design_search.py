@@ -237,7 +237,7 @@ def size_robot(
         return _refine_designs(problem, choice, designs, is_feasible, weights, free, along)
 
     def best_of(designs: _EvaluatedDesigns, count: int, weights: np.ndarray) -> np.ndarray:
-        return np.argsort(_cost(designs, is_feasible, weights))[:count]
+        return np.argsort(_cost(designs.f, designs.g, is_feasible, weights))[:count]
 
     tell(progress_remark("whole"))
     tried = _catalogue_designs(problem, choice, _promising_choices(drawn, is_feasible, columns))
@@ -260,7 +260,7 @@ def size_robot(
         margins = np.where(is_feasible, designs.g[k], np.nan)
         return _sized_design(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
 
-    ranked = [(c, d, k) for d in (free, buildable, coarse) for k, c in enumerate(_cost(d, is_feasible, first))]
+    ranked = [(c, d, k) for d in (free, buildable, coarse) for k, c in enumerate(_cost(d.f, d.g, is_feasible, first))]
     by_motor = dict[str, SizedDesign]()
     for _, designs, k in sorted(ranked, key=lambda c: c[0]):
         name = str(motors_of_choices[designs.rows[k]])
@@ -368,16 +368,16 @@ def _refine_designs(
     for _ in range(ROUNDS):
         candidates = np.clip((x[:, None] + box).reshape(-1, 3), choice.low[rows], choice.high[rows])
         f, g = evaluate_designs(problem, choice, rows, candidates)
-        cost = _cost(_EvaluatedDesigns(rows, candidates, f, g, 0), kept, weights).reshape(count, n)
+        cost = _cost(f, g, kept, weights).reshape(count, n)
         best = np.arange(count) * n + np.argmin(cost, axis=1)
         x, box = candidates[best], box * SHRINK
     return _EvaluatedDesigns(designs.rows, x, f[best], g[best], ROUNDS * len(rows))
 
 
-def _cost(designs: _EvaluatedDesigns, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Cost of designs: logarithm of the objective. Designs with a violated margin cost more than any feasible one."""
-    value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, designs.f, 1.0)), 0.0), axis=1)
-    short = np.sum(np.maximum(-designs.g[:, kept], 0.0), axis=1)
+    value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
+    short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
     return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)
 
 

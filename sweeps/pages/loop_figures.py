@@ -62,13 +62,13 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
 def draw_time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict: str) -> Figure:
     """Statistics that need histories: autocorrelation of the residual, waves in shaft angle, drift in time."""
     sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)][verdict == "none" :]
-    lags, limit = np.arange(1, detail.before.memory.lags + 1), 2 / np.sqrt(detail.samples)
+    lags, limit = np.arange(1, detail.before.lags + 1), 2 / np.sqrt(detail.samples)
     fig, ((*panels, explained),) = new_figure(1, len(channels) + 1, 2.9, width_ratios=[1] * len(channels) + [1.5])
     for axes, channel in zip(panels, channels, strict=True):
         axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
         axes.axhline(0, color=FAINT, lw=0.8)
         for when, side, colour in sides:
-            axes.plot(lags, side.memory.autocorrelation[channel.name], "o-", ms=3, lw=1, color=colour, label=when)
+            axes.plot(lags, side.autocorrelation[channel.name], "o-", ms=3, lw=1, color=colour, label=when)
         axes.set(title=channel.label, xlabel="lag [samples]")
     panels[0].set_ylabel("autocorrelation of the residual")
     panels[0].legend(loc="best")

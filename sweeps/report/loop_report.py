@@ -71,8 +71,8 @@ def _figures(
         if not found.refit_alone:
             lines = {"after_": "with the effects found", "before_": "before"}
         runs = dataclasses.replace(found.runs, columns={**found.runs.columns, **table})
-        memory = detail.before.memory
-        numbers = memory.deviate, detail.after.memory.deviate, memory.threshold, (2 * detail.runs) ** 0.5
+        before, after = detail.before, detail.after
+        numbers = before.deviate, after.deviate, before.threshold, (2 * detail.runs) ** 0.5
         names = ", ".join(detail.orders_unresolved)
         more = catalogue.text("loop.unresolved", names) if names else ""
         return (

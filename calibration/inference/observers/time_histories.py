@@ -667,15 +667,12 @@ class Histories(Observer):
             test, x = diagnosis.test, np.asarray(diagnosis.linear.series())
             power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
             by_lag = np.array([np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)])
-            memory = details.ResidualMemory(
-                float(test.found.white),
-                test.threshold("white"),
-                test.p("white"),
-                lags,
-                dict(zip(diagnosis.linear.channels, by_lag.T.tolist(), strict=True)),
-            )
+            autocorrelation = dict(zip(diagnosis.linear.channels, by_lag.T.tolist(), strict=True))
             waves = {(w, bases_room.ORDERS[w][0]): wave for w in orders if (wave := strongest(diagnosis, w))}
-            return details.FitOverTime(memory, waves, strongest(diagnosis, "time"))
+            return details.FitOverTime(
+                float(test.found.white), test.threshold("white"), test.p("white"), autocorrelation, waves,
+                strongest(diagnosis, "time"),
+            )  # fmt: skip
 
         samples = int((np.asarray(self.rows_of) >= 0).sum())
         unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)
