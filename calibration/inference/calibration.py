@@ -376,7 +376,7 @@ def _calibration_result(
         notes.append(Remark("of_rows", rows=jumps, what="jumps"))
     profile = None
     if setting.profiles:
-        profile = identifiability.profile_likelihoods(posed, jnp.asarray(z), float(found.best.cost), about)
+        profile = identifiability.profile_intervals(posed, jnp.asarray(z), float(found.best.cost), about)
     errors_by_kind = holdout.hold_out_by_kind(
         posed, z, {kind: holdout.blocks_of_kind(runs, kind) for kind in setting.kinds}
     )

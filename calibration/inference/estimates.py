@@ -9,7 +9,7 @@ import numpy as np
 from calibration.data import Columns
 from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
-from calibration.inference import identifiability, result, simulation_errors
+from calibration.inference import result, simulation_errors
 from calibration.inference.blocks import HeldOutFits
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.noise import Noise
@@ -34,7 +34,7 @@ def parameter_estimates(
     base: Robot,
     z: np.ndarray,
     about: Identifiability,
-    profile: identifiability.ProfileLikelihoods | None,
+    profile: tuple[np.ndarray, np.ndarray] | None,
     beside: np.ndarray | None,
     sources: dict[str, str],
     scans: Mapping[int, Scan],
@@ -44,7 +44,7 @@ def parameter_estimates(
     Args:
         posed, base: the problem, and the robot at the prior means.
         z: coordinates of the optimum.
-        about, profile: linear analysis at the optimum, and profile likelihoods, if any.
+        about, profile: linear analysis at the optimum, and intervals of `profile_intervals`, if any.
         beside: optimum of the same problem with `steady`, or None.
         sources: source of each prior that is not from a field.
         scans: scans of coordinates. Their intervals replace those of the profiles.
@@ -64,8 +64,7 @@ def parameter_estimates(
     for k, name in enumerate(coordinates.names):
         interval, is_open = linear[k], (False, False)
         if profile is not None:
-            interval = np.array([profile.low[k], profile.high[k]])
-            is_open = bool(profile.open[k, 0]), bool(profile.open[k, 1])
+            interval, is_open = profile[0][k], tuple(profile[1][k].tolist())
         if k in scans:
             is_open = scans[k].open()
             ends = [np.where(np.arange(len(z)) == k, x, point) for x in scans[k].interval()]

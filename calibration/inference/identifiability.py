@@ -8,7 +8,7 @@ from collections.abc import Collection
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from calibration.data import Names
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
@@ -152,31 +152,13 @@ def analyse_identifiability(problem: Problem, z: Array, slope: np.ndarray | None
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class ProfileLikelihoods:
-    """Profile likelihood of each parameter: the objective, minimised over all other parameters.
+def profile_intervals(
+    problem: Problem, z: Array, cost: float, about: Identifiability
+) -> tuple[Float[np.ndarray, "parameters 2"], Bool[np.ndarray, "parameters 2"]]:
+    """95 % interval of each parameter [SI] from its profile likelihood: the objective, minimised over all others.
 
-    Attributes:
-        z: coordinates of the profiled parameter, increasing, shape (parameters, points).
-        value: value of the parameter there [SI].
-        rise: rise of twice the objective above the optimum [σ²]: χ² with one degree of freedom.
-        low, high: ends of the 95 % interval, where the rise is 3.84 [SI], shape (parameters,).
-        open: True if an end lies beyond the last point, so that the interval is at least that wide, shape
-            (parameters, 2).
-        better: largest decrease below the given optimum among the refits [½σ²], 0 if the optimum is the best.
-    """
-
-    z: np.ndarray
-    value: np.ndarray
-    rise: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    open: np.ndarray
-    better: float
-
-
-def profile_likelihoods(problem: Problem, z: Array, cost: float, about: Identifiability) -> ProfileLikelihoods:
-    """Profile likelihoods of all parameters. All points of all profiles are refitted in one batch.
+    Also True for an end that lies beyond the last point of the profile, so that the interval is at least that wide.
+    All points of all profiles are refitted in one batch.
 
     Each refit starts where the linear analysis expects the other parameters. The ends of an interval are interpolated
     on the signed square root of the rise, which is straight for a linear model.
@@ -199,10 +181,8 @@ def profile_likelihoods(problem: Problem, z: Array, cost: float, about: Identifi
     # Where the signed root reaches ∓Z95, or the end points if it does not.
     rising = np.maximum.accumulate(root_all, 1)
     ends = np.array([np.interp([-Z95, Z95], r, a) for a, r in zip(at_all, rising, strict=True)])
-    value = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(at_all.T))).T
-    low, high = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(ends.T)))
-    is_open = np.stack([root_all[:, 0] > -Z95, root_all[:, -1] < Z95], 1)
-    return ProfileLikelihoods(at_all, value, root_all**2, low, high, is_open, float(max(0.0, -rise.min() / 2)))
+    interval = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(ends.T))).T
+    return interval, np.stack([root_all[:, 0] > -Z95, root_all[:, -1] < Z95], 1)
 
 
 # --- posteriors of fits ---------------------------------------------------------------------------

@@ -311,22 +311,18 @@ class SearchQueue:
     """Queue of members for a fixed number of parallel searches. Finished members are replaced by waiting ones.
 
     Attributes:
+        waiting: members that wait for a place, the next one last.
         holds: member in each place, -1 if the place is empty.
         ended: result of each finished member.
     """
 
     def __init__(self, members: Iterable[int], count: int) -> None:
         """Queue of members, with `count` empty places."""
-        self._waiting, self.holds = list(members)[::-1], np.full(count, -1)
+        self.waiting, self.holds = list(members)[::-1], np.full(count, -1)
         self.ended: dict[int, Any] = {}
 
     def __bool__(self) -> bool:
-        return bool(self._waiting) or bool(self.taken.any())
-
-    @property
-    def waiting(self) -> bool:
-        """True if members are queued."""
-        return bool(self._waiting)
+        return bool(self.waiting) or bool(self.taken.any())
 
     @property
     def taken(self) -> np.ndarray:
@@ -340,8 +336,8 @@ class SearchQueue:
 
     def fill(self) -> np.ndarray:
         """Moves waiting members into empty places. Returns these places."""
-        fresh = np.flatnonzero(~self.taken)[: len(self._waiting)]
-        self.holds[fresh] = [self._waiting.pop() for _ in fresh]
+        fresh = np.flatnonzero(~self.taken)[: len(self.waiting)]
+        self.holds[fresh] = [self.waiting.pop() for _ in fresh]
         return fresh
 
     def leave(self, over: np.ndarray, found: Any) -> None:

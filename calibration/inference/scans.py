@@ -106,28 +106,20 @@ def scan_coordinate(problem: Problem, z: np.ndarray, k: int) -> Scan:
     around, few = np.array([z[k], *scan.at[scan.local_minima()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
     if few > 2:
-        scan = _join_scans(scan, _scan_at(problem, z, k, np.resize(close, count)))
+        scan = _scan_at(problem, z, k, np.resize(close, count), scan)
     low, high = scan.interval()
-    return _join_scans(
-        scan, _scan_at(problem, z, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
-    )
+    return _scan_at(problem, z, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count), scan)
 
 
-def _scan_at(problem: Problem, z: np.ndarray, k: int, at: np.ndarray) -> Scan:
+def _scan_at(problem: Problem, z: np.ndarray, k: int, at: np.ndarray, before: Scan | None = None) -> Scan:
+    """Scan with further points."""
     at = np.clip(at, -RANGE, RANGE)
-    cost, other_coordinates = problem.observe.scan(problem, jnp.asarray(z), k, jnp.asarray(at))
-    return _sorted_scan(at, np.asarray(cost), np.asarray(other_coordinates))
-
-
-def _join_scans(one: Scan, two: Scan) -> Scan:
-    return _sorted_scan(
-        *(np.concatenate(x) for x in ((one.at, two.at), (one.cost, two.cost), (one.others, two.others)))
-    )
-
-
-def _sorted_scan(at: np.ndarray, cost: np.ndarray, others: np.ndarray) -> Scan:
-    order = np.unique(at, return_index=True)[1]
-    return Scan(at[order], np.where(np.isfinite(cost), cost, np.inf)[order], others[order])
+    points = at, *map(np.asarray, problem.observe.scan(problem, jnp.asarray(z), k, jnp.asarray(at)))
+    if before is not None:
+        points = tuple(np.concatenate(x) for x in zip((before.at, before.cost, before.others), points, strict=True))
+    order = np.unique(points[0], return_index=True)[1]
+    at, cost, others = (x[order] for x in points)
+    return Scan(at, np.where(np.isfinite(cost), cost, np.inf), others)
 
 
 def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
