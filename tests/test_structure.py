@@ -25,7 +25,9 @@ def sources(*folders):
     return {file.relative_to(ROOT).as_posix(): file.read_text(encoding="utf-8") for file in files}
 
 
-PREPARATION = r"(?<!def )\b(with_inferred_instruments|with_surface_configurations|with_initial_states|check_start)\("
+PREPARATION = (
+    r"(?<!def )\b(with_inferred_instruments|with_surface_configurations|measure_initial_states|check_start)\("
+)
 #: What only some modules do: a pattern of their text, and these modules.
 RULES = {
     "effects are summed in the balances": (r"\.term\(", ["mmrjax/model/balances.py"]),
