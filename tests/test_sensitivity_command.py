@@ -85,7 +85,7 @@ def test_inputs_are_those_of_the_priors(robot, study):
 def test_values_of_a_design_compile_nothing(study, compilations):
     """In NumPy they are the same as traced, row for row."""
     unit = np.random.default_rng(1).uniform(size=(3, len(study.inputs)))
-    values = study.values_at(study.inputs.scores(unit))
+    values = study.inputs.values(study.inputs.scores(unit))
     assert isinstance(values, np.ndarray) and not compilations
     traced = jax.jit(study.inputs.values)(study.inputs.scores(unit))
     assert_allclose(values, traced, rtol=1e-9)

@@ -280,26 +280,20 @@ def _continue_searches_separately(
 
 
 def with_solved_rows(problem: Problem, z: Z) -> Problem:
-    """Problem with its rows solved at z, by the program of the searches. Unchanged if its observer needs no separate
-    program.
-    """
+    """Problem with its rows solved at z. Unchanged if its observer needs no separate program."""
     if not problem.observe.apart:
         return problem
-    active = getattr(problem.coordinates, "active", None)
-    many = [
-        None if x is None else np.repeat(np.asarray(x)[None], problem.observe.searches_per_core(problem), 0)
-        for x in (z, active)
-    ]
-    return dataclasses.replace(problem, roots=jax.tree.map(lambda x: x[0], _solve_rows(problem, *many)))
+    return dataclasses.replace(
+        problem, roots=jax.tree.map(lambda x: x[0], solve_rows_at(problem, np.asarray(z)[None]))
+    )
 
 
 def solve_rows_at(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
-    """Solutions of the rows at several z (first axis), by the program of the searches. For a problem without
-    slots.
-    """
-    count = problem.observe.searches_per_core(problem)
+    """Solutions of the rows at several z (first axis), by the program of the searches."""
+    count, active = problem.observe.searches_per_core(problem), getattr(problem.coordinates, "active", None)
+    slots = None if active is None else np.repeat(np.asarray(active)[None], count, 0)
     filled = np.resize(zs, (-(-len(zs) // count) * count, zs.shape[1]))
-    parts = [jax.device_get(_solve_rows(problem, part, None)) for part in filled.reshape(-1, count, zs.shape[1])]
+    parts = [jax.device_get(_solve_rows(problem, part, slots)) for part in filled.reshape(-1, count, zs.shape[1])]
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(zs)], *parts)
 
 

@@ -62,7 +62,7 @@ def _results_at_points(
     groups.pop((), None)
     for input_set, group in groups.items():
         scores, analyse = design(input_set)
-        for k, outputs in study.sample(study.values_at(scores), group):
+        for k, outputs in study.sample(study.inputs.values(scores), group):
             for name in studies:
                 result, lost[name][k] = analyse(outputs[name])
                 if result is not None and lost[name][k] <= MOST_LOST:

@@ -75,10 +75,6 @@ class Study:
         """Indices of the inputs that act at a point: all except those of other configurations."""
         return self.inputs.acting(str(self.points.configuration[k]), self.robot.configurations.names)
 
-    def values_at(self, scores: np.ndarray) -> np.ndarray:
-        """Values of the model's columns for scores of all inputs."""
-        return np.asarray(self.inputs.values(scores))
-
     def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, Columns]]:
         """Yields the outputs at each point for the same sampled inputs. Evaluations are counted and timed.
 
@@ -145,10 +141,12 @@ def local_studies(study: Study) -> tuple[dict[str, OutputStudy], dict[str, dict[
     each status, by source.
     """
     inputs, points, d = study.inputs, len(study.points), len(study.inputs)
-    values = study.values_at(np.tile(inputs.centre, (points, 1)))
+    values = study.inputs.values(np.tile(inputs.centre, (points, 1)))
     answer = study.model(values, study.conditions)
     spread = jax.tree.map(lambda x: np.repeat(np.asarray(x), d), study.conditions)
-    ends = [study.model(study.values_at(np.tile(rows, (points, 1))), spread).values for rows in interval_ends(inputs)]
+    ends = [
+        study.model(study.inputs.values(np.tile(rows, (points, 1))), spread).values for rows in interval_ends(inputs)
+    ]
     # A condition's score is uniform in 0..1, with variance 1/12.
     weight = np.where(inputs.uniform, 1 / 12, 1.0)
     by_columns, outputs = study.model.derivatives(values, study.conditions), {}
@@ -200,6 +198,6 @@ def inert_inputs(study: Study, outputs: Mapping[str, OutputStudy], seed: int) ->
     points = np.unique(np.linspace(0, len(study.points) - 1, PLACES).astype(int))
     rows = np.repeat(scores, len(points), 0)
     conditions = jax.tree.map(lambda x: np.tile(np.asarray(x)[points], len(scores)), study.conditions)
-    for g in study.model.derivatives(study.values_at(rows), conditions).values():
+    for g in study.model.derivatives(study.inputs.values(rows), conditions).values():
         moving |= (np.nan_to_num(_derivatives_by_input(study.inputs, g)) != 0).any(0)
     return ~moving

@@ -174,19 +174,13 @@ def inputs_from_priors(
         raise BadConfiguration(str(error).replace("--prior", "--parameters")) from None
     size = len(names)
     parameters = posterior_of_coordinates(coordinates, np.zeros(size), np.eye(size)) if coordinates else NOTHING
-    return _inputs(robot, parameters, ranges, posterior=False)
+    return inputs_from_posterior(robot, parameters, ranges, is_posterior=False)
 
 
 def inputs_from_posterior(
-    robot: Robot, posterior: Posterior, ranges: Mapping[str, tuple[float, float]]
+    robot: Robot, parameters: Posterior, ranges: Mapping[str, tuple[float, float]], *, is_posterior: bool = True
 ) -> UncertainInputs:
-    """Inputs from the posterior of a calibrated robot, and from stated ranges of conditions."""
-    return _inputs(robot, posterior, ranges, posterior=True)
-
-
-def _inputs(
-    robot: Robot, parameters: Posterior, ranges: Mapping[str, tuple[float, float]], *, posterior: bool
-) -> UncertainInputs:
+    """Inputs from the posterior of a calibrated robot, or another distribution, and from ranges of conditions."""
     for name in ranges:
         stated_word(name, [n for n in CONDITIONS if n != "configuration"], f"--vary {name}", "no such condition")
     try:
@@ -201,4 +195,4 @@ def _inputs(
                 f"{axes[name].unit}, the smaller end first"
             )
     ends = np.array(list(ranges.values()), float).reshape(-1, 2)
-    return UncertainInputs(parameters, tuple(ranges), ends[:, 0], ends[:, 1], axes, posterior)
+    return UncertainInputs(parameters, tuple(ranges), ends[:, 0], ends[:, 1], axes, is_posterior)
