@@ -55,8 +55,8 @@ __all__ = sorted((*_HOME, *_ABOVE, "__version__"))
 #: Value for XLA_FLAGS, to be set before JAX is imported. It turns off LLVM's fast instruction selection, which acts
 #: at optimization level 0 and compiles some derivatives wrongly (NaN or zero; jaxlib 0.10.2).
 SOUND_AT_LEVEL_0 = "--xla_backend_extra_options=-fast-isel=false"
-#: Addition to it that halves the compilation of programs over time from jaxlib 0.11, which has no option for a single
-#: program any more (78 s of processor time for a log of 800 rows, 53 s with it).
+#: Addition to it that halves the compilation of programs over time from jaxlib 0.11 on, which has no such option for
+#: a single program (processor time for a log of 800 rows: 78 → 53 s).
 OLDER_EMITTERS = "xla_cpu_disable_new_fusion_emitters=true"
 #: Beginning of the names of threads that compute, which a process must not end around.
 WORKER = "mmrjax-worker"

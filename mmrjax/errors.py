@@ -51,19 +51,19 @@ def count_noun(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"  # a comparison of NumPy integers gives no Python bool
 
 
-def allowed_words(word: str, allowed: Iterable[str], most: int = 1, shown: Iterable[str] | None = None) -> str:
+def allowed_words(word: str, allowed: Iterable[str], limit: int = 1, listed: Iterable[str] | None = None) -> str:
     """Returns «did you mean X? allowed: ...» for an unknown word.
 
     Args:
         word: the unknown word.
         allowed: all valid words.
-        most: largest number of suggestions.
-        shown: the words to list as allowed, if not all.
+        limit: largest number of suggestions.
+        listed: the words to list as allowed, if not all.
     """
     allowed = list(allowed)
-    similar = similar_words(word, allowed, most)
+    similar = similar_words(word, allowed, limit)
     hint = f"did you mean {', '.join(similar)}? " if similar else ""
-    return f"{hint}allowed: {list_some(allowed if shown is None else shown)}"
+    return f"{hint}allowed: {list_some(allowed if listed is None else listed)}"
 
 
 def list_some(names: Iterable[str], width: int = 240) -> str:
@@ -75,15 +75,15 @@ def list_some(names: Iterable[str], width: int = 240) -> str:
     return ", ".join(names) if rest <= 1 else f"{', '.join(names[:listed_count])} and {rest} more"
 
 
-def similar_words(word: str, allowed: Iterable[str], most: int = 1) -> list[str]:
-    """Up to `most` of the allowed words that resemble one, ignoring case.
+def similar_words(word: str, allowed: Iterable[str], limit: int = 1) -> list[str]:
+    """Up to `limit` of the allowed words that resemble one, ignoring case.
 
     Words that contain it come first, in their order (`current` is a part of `total_current`).
     """
     folded = {a.casefold(): a for a in allowed}
     plain_word = word.casefold()
     parts = [f for f in folded if plain_word in re.split(r"[._ -]", f)]
-    close = difflib.get_close_matches(plain_word, folded, max(most, 1))
+    close = difflib.get_close_matches(plain_word, folded, max(limit, 1))
     return [folded[f] for f in dict.fromkeys([*([plain_word] if plain_word in folded else []), *parts, *close])][
-        :most
+        :limit
     ]

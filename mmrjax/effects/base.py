@@ -310,12 +310,12 @@ def scaled_effect(kind: type[Effect], factors: Factors) -> type[Effect]:
 
     Equal factors return the same class.
     """
-    sd, stretch, limits = factors
+    sd_factor, shape_factor, limit_factor = factors
     effect = kind()
-    fields = {amplitude_of(effect).name: _field(amplitude_of(effect), sd, limits)}
-    if (shape := free_shape_parameter(effect)) is not None and stretch != 1.0:
-        fields[shape.name] = _field(shape, stretch, stretch)
-    body: Mapping[str, object] = {
+    fields = {amplitude_of(effect).name: _field(amplitude_of(effect), sd_factor, limit_factor)}
+    if (shape := free_shape_parameter(effect)) is not None and shape_factor != 1.0:
+        fields[shape.name] = _field(shape, shape_factor, shape_factor)
+    namespace: Mapping[str, object] = {
         "__annotations__": {**dict.fromkeys(fields, "Scalar"), "factors": ClassVar[Factors]},
         "__module__": kind.__module__,
         "__doc__": kind.__doc__,
@@ -325,7 +325,7 @@ def scaled_effect(kind: type[Effect], factors: Factors) -> type[Effect]:
         "factors": factors,
         **fields,
     }
-    return type(kind.__name__, (kind,), dict(body))
+    return type(kind.__name__, (kind,), dict(namespace))
 
 
 def _field(parameter: Parameter, factor: float, limits: float) -> Any:

@@ -111,21 +111,21 @@ def direction_signal(place: str) -> str:
     return PLACES[place][2]
 
 
-def sign_factor(place: str, way: Callable[[str], Any], magnitudes: Container[str]) -> Any:
+def sign_factor(place: str, direction_of: Callable[[str], Any], magnitudes: Container[str]) -> Any:
     """Sign factor of a discrepancy in a place: a run in mirror image shows it in mirror image.
 
     For instruments that show only magnitudes the factor is 1.
 
     Args:
-        way: returns the signal of `WAYS` of a name.
+        direction_of: returns the signal of `WAYS` of a name.
         magnitudes: channels of such instruments.
     """
-    counts = way(direction_signal(place))
-    return abs(counts) if place in magnitudes else counts
+    factor = direction_of(direction_signal(place))
+    return abs(factor) if place in magnitudes else factor
 
 
 def in_travel_frame(
-    place: str, variable: str, x: Any, way: Callable[[str], Any], magnitudes: Container[str] = ()
+    place: str, variable: str, x: Any, direction_of: Callable[[str], Any], magnitudes: Container[str] = ()
 ) -> tuple[Any, Any]:
     """A variable of a curve in the frame of travel, and its sign factor, see `sign_factor`.
 
@@ -133,15 +133,16 @@ def in_travel_frame(
 
     Args:
         x: the variable [its unit], an array of NumPy or JAX.
-        way, magnitudes: as for `sign_factor`.
+        direction_of, magnitudes: as for `sign_factor`.
     """
     if variable not in EVERY_VARIABLE:
         return x, 1.0
-    counts, sign = sign_factor(place, way, magnitudes), EVERY_VARIABLE[variable].sign
+    factor = sign_factor(place, direction_of, magnitudes)
+    sign = EVERY_VARIABLE[variable].sign
     if not sign:
-        return x, counts
-    along = "direction_turn" if sign == TURN else "direction" if place in ROUND else direction_signal(place)
-    return x * way(along), counts
+        return x, factor
+    signal_name = "direction_turn" if sign == TURN else "direction" if place in ROUND else direction_signal(place)
+    return x * direction_of(signal_name), factor
 
 
 _LAST = len(ORDINATES) - 1
@@ -186,9 +187,9 @@ def _size(unit: str, size: float) -> Scalar:
 
 def _curve_docstring(place: str, over: str) -> str:
     """Docstring of a curve: its equation with its units, and its source."""
-    place_words = f"the readings of `{place}`" if place in READINGS else f"the balance `{place}`"
+    place_phrase = f"the readings of `{place}`" if place in READINGS else f"the balance `{place}`"
     unit, unit_x = PLACES[place][0], EVERY_VARIABLE[over].unit
-    return f"""Δ = a y(x) along the travel in {place_words} [{unit}], x = {over} [{unit_x}].
+    return f"""Δ = a y(x) along the travel in {place_phrase} [{unit}], x = {over} [{unit_x}].
 
     y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
 
@@ -231,10 +232,10 @@ def _curve_class(place: str, over: str) -> type[Effect]:
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
             x = self.recall(robot, signals) if over == "time" else getattr(signals, over)
-            ways = lambda name: jnp.asarray(getattr(signals, name))  # noqa: E731
-            x, way = in_travel_frame(place, over, x, ways, robot.rig.magnitudes)
+            direction_of = lambda name: jnp.asarray(getattr(signals, name))  # noqa: E731
+            x, factor = in_travel_frame(place, over, x, direction_of, robot.rig.magnitudes)
             y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
-            return self.amplitude * jnp.sum(ordinate_weights(x, self.low, self.high) * y, -1) * way
+            return self.amplitude * jnp.sum(ordinate_weights(x, self.low, self.high) * y, -1) * factor
 
         def rate(self, robot: Robot, signals: Signals) -> Scalar:
             """Rate of time [s/s]. Only a curve over time has a memory."""

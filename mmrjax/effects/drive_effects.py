@@ -96,8 +96,8 @@ class IronLoss(MotorEffect):
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        share = signals.speed_motor / self.speed_critical
-        return self.amplitude * 2 * share / (1 + share**2)
+        ratio = signals.speed_motor / self.speed_critical
+        return self.amplitude * 2 * ratio / (1 + ratio**2)
 
 
 class TorqueConstantSaturation(MotorEffect):
@@ -152,8 +152,8 @@ class Cogging(Periodic, MotorEffect):
         return self.ripples
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        share = self.ripples * signals.speed_motor / self.rate_fade
-        fade = contact.cubic_step(share**2, 1.0, 1.0, 4.0, 0.0)
+        ratio = self.ripples * signals.speed_motor / self.rate_fade
+        fade = contact.cubic_step(ratio**2, 1.0, 1.0, 4.0, 0.0)
         return self.amplitude * self.wave(signals) * fade
 
     def step_longest(self, robot: Robot, conditions: Conditions) -> float:
@@ -255,8 +255,8 @@ class BackdrivingLoss(GearboxEffect):
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        driving = at_least(0.0, -signals.torque_carried * signals.direction)
-        return self.amplitude * driving * signals.direction
+        backdriving = at_least(0.0, -signals.torque_carried * signals.direction)
+        return self.amplitude * backdriving * signals.direction
 
 
 class BristleLoadLoss(Bristle, GearboxEffect):
@@ -306,6 +306,7 @@ class BristleBackdrivingLoss(Bristle, GearboxEffect):
     angle_breakaway: Scalar = breakaway_parameter()
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        load, bend = signals.torque_carried, self.recall(robot, signals)
-        driving = magnitude(load, signals.direction) * bend - load * bend**2
-        return 0.5 * self.amplitude * driving
+        load = signals.torque_carried
+        bend = self.recall(robot, signals)
+        backdriving = magnitude(load, signals.direction) * bend - load * bend**2
+        return 0.5 * self.amplitude * backdriving

@@ -100,30 +100,34 @@ class SpeedGain(SensorEffect):
     )  # fmt: skip
 
 
-def _sensor_error(read: Channel, of_zero: bool) -> type[Effect]:
+def _sensor_error(measured: Channel, of_zero: bool) -> type[Effect]:
     """The error of scale or zero of a channel's instrument."""
-    largest, unit = (10 * read.zero_error, read.unit_si) if of_zero else (0.2, "-")
-    source = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
-    if read.unit_shown == "°C":
-        source = "tolerances of thermocouples, IEC 60584-1", "class of the instrument: 1 to 3 K"
-    odd, zero = of_zero and read.directed, of_zero
+    largest, unit = (10 * measured.zero_error, measured.unit_si) if of_zero else (0.2, "-")
+    sources = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
+    if measured.unit_shown == "°C":
+        sources = "tolerances of thermocouples, IEC 60584-1", "class of the instrument: 1 to 3 K"
+    is_odd = of_zero and measured.directed
+    is_zero = of_zero
 
     class Error(SensorEffect):
-        name = f"{read.name}_{'offset' if zero else 'gain'}"
-        channel = read.name
-        of_zero = zero
-        odd_in_travel = odd
+        name = f"{measured.name}_{'offset' if is_zero else 'gain'}"
+        channel = measured.name
+        of_zero = is_zero
+        odd_in_travel = is_odd
 
         amplitude: Scalar = amplitude(
-            unit, f"error of the {read.label} reading" if zero else f"relative error of the {read.label} reading",
-            (-largest, largest), source[1], sd=read.zero_error if zero else 0.02,
+            unit,
+            f"error of the {measured.label} reading"
+            if is_zero
+            else f"relative error of the {measured.label} reading",
+            (-largest, largest), sources[1], sd=measured.zero_error if is_zero else 0.02,
         )  # fmt: skip
 
-    Error.__doc__ = f"""Δx = a{"" if zero else " x"} in the reading x of {read.label}.
+    Error.__doc__ = f"""Δx = a{"" if is_zero else " x"} in the reading x of {measured.label}.
 
-    The {"zero" if zero else "scale"} of the instrument is wrong.
+    The {"zero" if is_zero else "scale"} of the instrument is wrong.
 
-    Source: {source[0]}.
+    Source: {sources[0]}.
     """
     return name_class(Error, "".join(word.capitalize() for word in Error.name.split("_")))
 
@@ -182,9 +186,9 @@ class DutyExponent(DutyEffect):
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         log = jnp.log(at_least(jnp.abs(signals.command), LEAST_POWER))
         exponent = (self.exponent - 1) * log
-        near = jnp.abs(exponent) < 1e-6
-        far = jnp.where(near, 1.0, exponent)
-        ratio = jnp.where(near, 1 + exponent / 2, jnp.expm1(far) / far)
+        is_small = jnp.abs(exponent) < 1e-6
+        nonzero_exponent = jnp.where(is_small, 1.0, exponent)
+        ratio = jnp.where(is_small, 1 + exponent / 2, jnp.expm1(nonzero_exponent) / nonzero_exponent)
         return -self.amplitude * signals.command * log * ratio
 
 

@@ -138,8 +138,8 @@ class BendingLoss(TrackEffect):
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        share = signals.speed_wheel / self.speed_relaxation
-        return self.amplitude * 2 * share / (1 + share**2)
+        ratio = signals.speed_wheel / self.speed_relaxation
+        return self.amplitude * 2 * ratio / (1 + ratio**2)
 
 
 class StickSlip(TrackEffect):
@@ -179,8 +179,8 @@ class StickSlip(TrackEffect):
 
     def rate(self, robot: Robot, signals: Signals) -> Scalar:
         speed = signals.speed_wheel
-        turn = speed * self._excess(signals) - speed * signals.direction * signals.memory[self.name]
-        return turn / self.angle_breakaway
+        bend_speed = speed * self._excess(signals) - speed * signals.direction * signals.memory[self.name]
+        return bend_speed / self.angle_breakaway
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * self.recall(robot, signals)
@@ -230,8 +230,8 @@ class StribeckExponent(TrackEffect):
     amplitude: Scalar = amplitude(
         "N·m", "loss torque at rest beyond M_t0", (-0.1, 1.0), "a third of M_t0 of Table 3", sd=0.1
     )
-    # The loop frees the first of two shapes, ω_s. For a curve with any δ from 1/2 to 2, after dry and viscous
-    # friction are fitted, δ = 1 and δ = 2 with ω_s free leave half the residual of a free δ at one ω_s and δ = 1.
+    # The loop frees the first of two shapes, ω_s. Test: curves with any δ from 1/2 to 2, after a fit of dry and
+    # viscous friction. With ω_s free, δ = 1 and δ = 2 leave half the residual of a free δ at one ω_s and δ = 1.
     speed_fade: Scalar = _fade_parameter(0.05)
     exponent: Scalar = parameter(
         2.0, "-", "exponent δ of the speed", (0.5, 4.0),
@@ -239,8 +239,8 @@ class StribeckExponent(TrackEffect):
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        share = (signals.speed_wheel / self.speed_fade) ** 2 + 1e-3**2
-        return self.amplitude * jnp.exp(-(share ** (0.5 * self.exponent))) * signals.direction
+        squared_ratio = (signals.speed_wheel / self.speed_fade) ** 2 + 1e-3**2
+        return self.amplitude * jnp.exp(-(squared_ratio ** (0.5 * self.exponent))) * signals.direction
 
 
 class DirectionalViscous(TrackEffect):

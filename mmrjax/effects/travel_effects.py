@@ -326,5 +326,5 @@ class VibrationSlip(SlipEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         adhesion_used = signals.demand / signals.adhesion_limit
-        faster = jnp.hypot(signals.speed_theoretical / self.speed_reference, SLOWEST) ** self.exponent
-        return self.amplitude * faster * adhesion_used / jnp.hypot(1 - jnp.abs(adhesion_used), ROUNDED)
+        speed_factor = jnp.hypot(signals.speed_theoretical / self.speed_reference, SLOWEST) ** self.exponent
+        return self.amplitude * speed_factor * adhesion_used / jnp.hypot(1 - jnp.abs(adhesion_used), ROUNDED)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.climbing import resting_posture
 from mmrjax.model import channels, contact, masses, power
-from mmrjax.model import chassis as chassis_room
+from mmrjax.model import chassis as chassis_module
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, Scalars
@@ -71,10 +71,10 @@ def effects_sum(robot: Robot, signals: Signals, balance: str, channel: str = "")
     """
     if balance in robot.lacks:
         return 0.0
-    entering = [e for e in robot.effects if e.balance == balance and e.channel == channel]
+    effects = [e for e in robot.effects if e.balance == balance and e.channel == channel]
     terms = [
         e.term(robot, signals) if e.acts_everywhere else e.acts(robot, signals) * e.term(robot, signals)
-        for e in entering
+        for e in effects
     ]
     return sum(terms) if terms else 0.0
 
@@ -91,15 +91,15 @@ def bridge_duty(robot: Robot, conditions: Conditions) -> Scalar:
     """Duty that the bridge gives for the demanded one [-], before its current limit, in the same direction."""
     if conditions.voltage_follows or not any(e.balance == "duty" for e in robot.effects):
         return conditions.duty
-    demanded = Signals(
+    signals = Signals(
         configuration=conditions.configuration,
         on_tracks=robot.chassis(conditions.configuration).on_tracks,
         battery=conditions.battery,
         order=conditions.order,
         command=conditions.duty,
     )
-    way = jnp.where(conditions.duty < 0, -1.0, 1.0)
-    return way * clip(way * (conditions.duty - effects_sum(robot, demanded, "duty")), 0.0, 1.0)
+    sign = jnp.where(conditions.duty < 0, -1.0, 1.0)
+    return sign * clip(sign * (conditions.duty - effects_sum(robot, signals, "duty")), 0.0, 1.0)
 
 
 def controller_reading(robot: Robot, conditions: Conditions, state: State) -> tuple[Scalar, Scalar]:
@@ -122,21 +122,21 @@ def with_controller_duty(robot: Robot, conditions: Conditions, state: State) -> 
 def _controller_duty(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Duty that a controller wants [-]."""
     assert robot.controller is not None and conditions.goal is not None
-    shown, speed = controller_reading(robot, conditions, state)
+    reading, speed = controller_reading(robot, conditions, state)
     goal_feed_forward = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
     integral = 0.0 if state.integral is None else state.integral
-    return robot.controller.duty(conditions.goal - shown, integral, speed, goal_feed_forward)
+    return robot.controller.duty(conditions.goal - reading, integral, speed, goal_feed_forward)
 
 
 def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list[Scalar]:
     """Rates of change of the controller's states: its integral (the error, or 0 while it would drive the duty beyond
     its limit), and the lagged duty.
     """
-    none = jnp.zeros_like(state.speed)
+    zero = jnp.zeros_like(state.speed)
     if conditions.goal is None or robot.controller is None:
-        return [none] * len(robot.controller_states)
+        return [zero] * len(robot.controller_states)
     if state.clock is not None:
-        return [*[none] * (len(robot.controller_states) - 1), none - 1.0]
+        return [*[zero] * (len(robot.controller_states) - 1), zero - 1.0]
     duty, integrated = _controller_actions(robot, conditions, state)
     return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
 
@@ -146,8 +146,8 @@ def _controller_actions(robot: Robot, conditions: Conditions, state: State) -> t
     assert robot.controller is not None and conditions.goal is not None
     duty = _controller_duty(robot, conditions, state)
     error = conditions.goal - controller_reading(robot, conditions, state)[0]
-    limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
-    return duty, jnp.where(limited | (conditions.open > 0.5), 0.0, error)
+    saturated = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
+    return duty, jnp.where(saturated | (conditions.open > 0.5), 0.0, error)
 
 
 #: Share of a controller's period that may be left when a sample is due, for rounding.
@@ -156,14 +156,18 @@ DUE = 1e-6
 
 def sampled_controller(robot: Robot, conditions: Conditions, state: State) -> State:
     """State after a controller with a rate has read it, if a sample is due. Of other controllers the same state."""
-    own = robot.controller
-    if own is None or conditions.goal is None or state.clock is None or state.integral is None:
+    controller = robot.controller
+    if controller is None or conditions.goal is None or state.clock is None or state.integral is None:
         return state
     duty, error = _controller_actions(robot, conditions, state)
     command = duty if state.pending is None else state.pending
-    values = {"integral": state.integral + error / own.rate, "command": command, "clock": state.clock + 1 / own.rate}
+    values = {
+        "integral": state.integral + error / controller.rate,
+        "command": command,
+        "clock": state.clock + 1 / controller.rate,
+    }
     values |= {} if state.pending is None else {"pending": duty}
-    due = state.clock <= DUE / own.rate
+    due = state.clock <= DUE / controller.rate
     changed: Any = {name: jnp.where(due, value, getattr(state, name)) for name, value in values.items()}
     return replace(state, **changed)
 
@@ -175,10 +179,10 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
     speed_theoretical = chassis.radius * speed_wheel
     speed_still = chassis.speed_still
     duty = robot.driver.duty_limited(bridge_duty(robot, conditions), state.current, conditions.polarity)
-    straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
+    zero_motion = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
     signals = _fill_unset(
         Signals(),
-        **straight,
+        **zero_motion,
         configuration=conditions.configuration,
         on_tracks=chassis.on_tracks,
         slope=conditions.slope,
@@ -209,7 +213,7 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
         return _fill_unset(signals, mass=jnp.zeros_like(state.speed), normal=jnp.zeros_like(state.speed))
     total_mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     mass = total_mass + effects_sum(robot, _fill_unset(signals, mass=total_mass), "mass")
-    normal = chassis_room.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
+    normal = chassis_module.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
     return _fill_unset(signals, mass=mass, normal=normal)
 
 
@@ -230,8 +234,12 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     voltage = robot.driver.voltage(
         source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back_emf
     )
-    demanded, limited = (conditions.polarity * duty for duty in (bridge_duty(robot, conditions), signals.duty))
-    conducts = robot.driver.conducts(demanded, limited, signals.current, voltage - back_emf, conditions.open)
+    demanded_duty, limited_duty = (
+        conditions.polarity * duty for duty in (bridge_duty(robot, conditions), signals.duty)
+    )
+    conducts = robot.driver.conducts(
+        demanded_duty, limited_duty, signals.current, voltage - back_emf, conditions.open
+    )
     voltage = jnp.where(conducts == 1, voltage, back_emf + conducts * (voltage - back_emf))
     return _fill_unset(signals, voltage_source=source, voltage=voltage)
 
@@ -250,9 +258,8 @@ def charge_drawn(robot: Robot, conditions: Conditions, total_current: Scalar) ->
 def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     """Voltage available to change the current [V].
 
-    With an imposed speed, the voltage that this speed needs. With an
-    imposed current, the voltage of an amplifier that brings the current to its set value within the winding's time
-    constant.
+    With an imposed speed, the voltage that this speed needs. With an imposed current, the voltage of an amplifier
+    that brings the current to its set value within the winding's time constant.
     """
     back_emf = robot.motor.voltage_back(signals.speed_motor)
     drop = robot.motor.voltage_winding(signals.current, signals.temperature) + effects_sum(
@@ -337,7 +344,7 @@ TORQUE_STEPS = 4
 
 
 def gearbox(
-    robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None = None, *, settled: bool = False
+    robot: Robot, chassis: Load, signals: Signals, mover_torque: Scalar | None = None, *, settled: bool = False
 ) -> Signals:
     """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
 
@@ -346,69 +353,77 @@ def gearbox(
     method finds it.
 
     Args:
-        mover: the mover's torque on the shaft in addition to the track losses [N·m]. None: the traction.
+        mover_torque: the mover's torque on the shaft in addition to the track losses [N·m]. None: the traction.
         settled: True in steady travel: the torque at the output is B.
     """
-    mover = chassis.radius * signals.traction if mover is None else mover
-    load = signals.torque_track_loss + mover
+    mover_torque = chassis.radius * signals.traction if mover_torque is None else mover_torque
+    load_torque = signals.torque_track_loss + mover_torque
 
-    def at_output(torque: Scalar) -> Signals:
-        carrying = _fill_unset(signals, torque_carried=torque)
-        return _gearbox_signals(robot, chassis, carrying, load, effects_sum(robot, carrying, "gearbox"))
+    def signals_at_torque(torque: Scalar) -> Signals:
+        carrying_signals = _fill_unset(signals, torque_carried=torque)
+        return _gearbox_signals(
+            robot, chassis, carrying_signals, load_torque, effects_sum(robot, carrying_signals, "gearbox")
+        )
 
-    def transmitted(output: Signals) -> Scalar:
-        return load + (chassis.inertia + output.inertia_added) * output.acceleration_wheel
+    def transmitted_torque(output_signals: Signals) -> Scalar:
+        return load_torque + (chassis.inertia + output_signals.inertia_added) * output_signals.acceleration_wheel
 
-    def surplus(torque: Scalar) -> Scalar:
-        return torque - transmitted(at_output(torque))
+    def torque_error(torque: Scalar) -> Scalar:
+        return torque - transmitted_torque(signals_at_torque(torque))
 
-    torque, output = load, at_output(load)
+    torque = load_torque
+    output_signals = signals_at_torque(load_torque)
     if settled:
-        return output
+        return output_signals
     if not any(e.balance == "gearbox" for e in robot.effects):
-        return _fill_unset(output, torque_carried=transmitted(output))
+        return _fill_unset(output_signals, torque_carried=transmitted_torque(output_signals))
     for _ in range(TORQUE_STEPS):
-        residual, rise = value_and_slope(surplus, torque)
-        torque = torque - residual / rise
-    return at_output(torque)
+        residual, slope = value_and_slope(torque_error, torque)
+        torque = torque - residual / slope
+    return signals_at_torque(torque)
 
 
-def _gearbox_signals(robot: Robot, chassis: Load, signals: Signals, load: Scalar, own: Scalar) -> Signals:
-    """Signals of a gearbox whose effects lose `own` under a load [N·m].
+def _gearbox_signals(
+    robot: Robot, chassis: Load, signals: Signals, load_torque: Scalar, effect_loss: Scalar
+) -> Signals:
+    """Signals of a gearbox whose effects lose `effect_loss` under a load [N·m].
 
     Let A be the motor torque less the idle loss, and B the load at the output. The transmitted torque has the sign of
     A J_w + i J_d B at any efficiency. That sign decides the direction in which the load loss acts.
     """
-    gear, inertia_motor = robot.gearbox, robot.motor.inertia
+    gear = robot.gearbox
+    inertia_motor = robot.motor.inertia
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
-    load = load + own
-    drive = signals.torque_motor - idle
+    load_torque = load_torque + effect_loss
+    driving_torque = signals.torque_motor - idle
     inertia_added = effects_sum(robot, signals, "inertia")
     # Shafts without inertia get a very small one, which decides the direction of power and the torque transmitted.
     inertia_wheel = chassis.inertia + inertia_added
-    next_to_none = LEAST_INERTIA + at_least(
+    small_inertia = LEAST_INERTIA + at_least(
         inertia_wheel, 0.0
     )  # keeps the derivative with respect to an added inertia
-    inertia_wheel = jnp.where(inertia_wheel < LEAST_INERTIA, next_to_none, inertia_wheel)
-    through = gear.ratio * inertia_motor
-    side = (drive * inertia_wheel + through * load) / (inertia_wheel + through)
-    efficiency = gear.efficiency_flow(side, signals.direction)
-    net = gear.ratio * efficiency * drive - load
-    inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, inertia_wheel)
+    inertia_wheel = jnp.where(inertia_wheel < LEAST_INERTIA, small_inertia, inertia_wheel)
+    motor_inertia_times_ratio = gear.ratio * inertia_motor
+    transmitted = (driving_torque * inertia_wheel + motor_inertia_times_ratio * load_torque) / (
+        inertia_wheel + motor_inertia_times_ratio
+    )
+    efficiency = gear.efficiency_flow(transmitted, signals.direction)
+    net = gear.ratio * efficiency * driving_torque - load_torque
+    inertia = chassis_module.inertia_reduced(inertia_motor, gear.ratio, efficiency, inertia_wheel)
     acceleration = net / inertia
     torque_input = signals.torque_motor - inertia_motor * gear.ratio * acceleration
     torque_gear = gear.ratio * efficiency * (torque_input - idle)
     return _fill_unset(
         signals,
         torque_idle=idle,
-        torque_load=load,
+        torque_load=load_torque,
         inertia_added=inertia_added,
         efficiency_load=efficiency,
         torque_net=net,
         acceleration_wheel=acceleration,
         torque_input=torque_input,
         torque_gear=torque_gear,
-        torque_output=torque_gear - own,
+        torque_output=torque_gear - effect_loss,
     )
 
 
@@ -424,21 +439,22 @@ def _traction_and_net_force(robot: Robot, signals: Signals, traction: Scalar) ->
     return _fill_unset(signals, traction=traction, acceleration=acceleration)
 
 
-def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
+def moving_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
     """All signals of a robot in motion: traction follows from sliding by the friction law.
 
     With an imposed motor speed, the current follows from the torque.
 
     Args:
-        way: direction of motion that dry friction opposes, ±1 [-]. None or 0: from the speeds, smooth through rest.
+        direction: direction of motion that dry friction opposes, ±1 [-]. None or 0: from the speeds, smooth through
+            rest.
     """
     conditions = with_controller_duty(robot, conditions, state)
     if conditions.motor_speed is not None:
-        state = replace(state, current=_current_for_acceleration(robot, conditions, state, way))
-    return _signals_in_motion(robot, conditions, state, way)
+        state = replace(state, current=_current_for_acceleration(robot, conditions, state, direction))
+    return _signals_in_motion(robot, conditions, state, direction)
 
 
-def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
+def rolling_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
     """All signals of a robot in motion whose load turns rigidly with its wheels.
 
     The load's inertia acts at the driving shaft, and traction is what the inertia and the demand need.
@@ -448,80 +464,85 @@ def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Sca
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
     if isinstance(chassis, Shaft):
-        return moving_signals(robot, conditions, state, way)
+        return moving_signals(robot, conditions, state, direction)
     signals = _signals_up_to_slip(
-        robot, conditions, chassis, _with_direction(begin_signals(robot, conditions, state), way)
+        robot, conditions, chassis, _with_direction(begin_signals(robot, conditions, state), direction)
     )
     signals = track(robot, chassis, _fill_unset(signals, traction=signals.demand))
-    carried = signals.mass * (1 / robot.sides)
-    heavy = replace(chassis, inertia=chassis.inertia + carried * chassis.radius**2)
-    signals = gearbox(robot, heavy, signals)
+    side_mass = signals.mass * (1 / robot.sides)
+    loaded_chassis = replace(chassis, inertia=chassis.inertia + side_mass * chassis.radius**2)
+    signals = gearbox(robot, loaded_chassis, signals)
     acceleration = chassis.radius * signals.acceleration_wheel
-    return _fill_unset(signals, acceleration=acceleration, traction=signals.demand + carried * acceleration)
+    return _fill_unset(signals, acceleration=acceleration, traction=signals.demand + side_mass * acceleration)
 
 
-def _with_direction(signals: Signals, way: Scalar | None) -> Signals:
+def _with_direction(signals: Signals, direction: Scalar | None) -> Signals:
     """Signals with the direction that dry friction opposes, as in `moving_signals`."""
-    if way is None:
+    if direction is None:
         return signals
-    directions = "direction", "direction_travel"
-    return _fill_unset(signals, **{d: jnp.where(way == 0, getattr(signals, d), way) for d in directions})
+    fields = "direction", "direction_travel"
+    return _fill_unset(
+        signals, **{field: jnp.where(direction == 0, getattr(signals, field), direction) for field in fields}
+    )
 
 
 #: Newton steps of the current at an imposed speed: torque is linear in it except for effects and the power direction.
 CURRENT_STEPS = 4
 
 
-def _current_for_acceleration(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Scalar:
+def _current_for_acceleration(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Scalar:
     """Motor current that gives the imposed acceleration [A]."""
 
-    def at(given: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
-        robot, conditions, state = given
-        return _signals_in_motion(robot, conditions, replace(state, current=current), way)
+    def signals_at(inputs: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
+        robot, conditions, state = inputs
+        return _signals_in_motion(robot, conditions, replace(state, current=current), direction)
 
-    return _solve_current(at, (robot, conditions, state))
+    return _solve_current(signals_at, (robot, conditions, state))
 
 
 def _signals_at_imposed_speed(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
     """Signals of a side whose motor speed is imposed and whose traction is known."""
 
-    def at(given: tuple[Robot, Conditions, Chassis, Signals], current: Scalar) -> Signals:
-        robot, conditions, chassis, signals = given
-        total = robot.sides * current * signals.share_drawn
-        signals_at_current = electrical(robot, conditions, _fill_unset(signals, current=current, total_current=total))
-        return gearbox(robot, chassis, motor(robot, signals_at_current))
+    def signals_at(inputs: tuple[Robot, Conditions, Chassis, Signals], current: Scalar) -> Signals:
+        robot, conditions, chassis, signals = inputs
+        total_current = robot.sides * current * signals.share_drawn
+        electrical_signals = electrical(
+            robot, conditions, _fill_unset(signals, current=current, total_current=total_current)
+        )
+        return gearbox(robot, chassis, motor(robot, electrical_signals))
 
     inputs = robot, conditions, chassis, signals
-    return at(inputs, _solve_current(at, inputs))
+    return signals_at(inputs, _solve_current(signals_at, inputs))
 
 
-def _solve_current(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scalar:
+def _solve_current(signals_at: Callable[[Any, Scalar], Signals], inputs: tuple) -> Scalar:
     """Motor current that gives the imposed acceleration [A].
 
     Args:
-        signals: function of `given` and a current [A].
-        given: robot, conditions and further inputs. Only the last Newton step is differentiated with respect to them.
+        signals_at: function of `inputs` and a current [A].
+        inputs: robot, conditions and further inputs. Only the last Newton step is differentiated with respect to
+            them.
     """
 
-    def lacking(given: tuple, current: Scalar) -> Scalar:
-        robot, conditions, *_ = given
+    def acceleration_error(inputs: tuple, current: Scalar) -> Scalar:
+        robot, conditions, *_ = inputs
         acceleration_imposed = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
-        return signals(given, current).acceleration_wheel * robot.gearbox.ratio - acceleration_imposed
+        return signals_at(inputs, current).acceleration_wheel * robot.gearbox.ratio - acceleration_imposed
 
-    fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, given)
-    current = jnp.zeros_like(jnp.asarray(fixed[1].motor_speed))
+    constant_inputs = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, inputs)
+    current = jnp.zeros_like(jnp.asarray(constant_inputs[1].motor_speed))
     for step in range(CURRENT_STEPS):
-        residual, rise = value_and_slope(lambda x: lacking(fixed, x), current)
-        residual = lacking(given, current) if step == CURRENT_STEPS - 1 else residual
-        current = current - residual / rise
+        residual, slope = value_and_slope(lambda x: acceleration_error(constant_inputs, x), current)
+        residual = acceleration_error(inputs, current) if step == CURRENT_STEPS - 1 else residual
+        current = current - residual / slope
     return current
 
 
-def _signals_in_motion(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
+def _signals_in_motion(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
     signals = _signals_up_to_slip(
-        robot, conditions, chassis, _with_direction(begin_signals(robot, conditions, state), way)
+        robot, conditions, chassis, _with_direction(begin_signals(robot, conditions, state), direction)
     )
     if isinstance(chassis, Shaft):
         signals = _fill_unset(signals, traction=signals.demand)
@@ -541,26 +562,26 @@ def _joint_signals(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) 
     loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + effects_sum(robot, signals, "track")
     inertia_added = effects_sum(robot, signals, "inertia")
     inertia_motor = robot.motor.inertia * gear.ratio**2
-    mesh = chassis.torque_joint(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
-    signals = _fill_unset(signals, torque_track_loss=loss, torque_carried=mesh)
+    mesh_torque = chassis.torque_joint(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
+    signals = _fill_unset(signals, torque_track_loss=loss, torque_carried=mesh_torque)
     added_loss = effects_sum(robot, signals, "gearbox")
-    efficiency = gear.efficiency_flow(mesh, signals.direction)
-    drive = signals.torque_motor - idle
-    net = gear.ratio * drive - mesh / efficiency - added_loss
+    efficiency = gear.efficiency_flow(mesh_torque, signals.direction)
+    driving_torque = signals.torque_motor - idle
+    net = gear.ratio * driving_torque - mesh_torque / efficiency - added_loss
     acceleration = net / inertia_motor
     return _fill_unset(
         signals,
         torque_idle=idle,
-        torque_load=mesh + added_loss,
+        torque_load=mesh_torque + added_loss,
         inertia_added=inertia_added,
         efficiency_load=efficiency,
         torque_net=net,
         acceleration_wheel=acceleration,
         torque_input=signals.torque_motor - robot.motor.inertia * gear.ratio * acceleration,
-        torque_gear=mesh + added_loss,
-        torque_output=mesh,
+        torque_gear=mesh_torque + added_loss,
+        torque_output=mesh_torque,
         acceleration=chassis.radius
-        * (mesh - loss - opposing_torque(chassis, signals))
+        * (mesh_torque - loss - opposing_torque(chassis, signals))
         / (chassis.inertia + inertia_added),
     )
 
@@ -594,15 +615,16 @@ def resolved_signals(
     chassis = replace(robot.chassis(conditions.configuration), inertia=inertia)
     signals = _fill_unset(begin_signals(robot, conditions, state), normal=mover.normal)
     signals = _signals_up_to_slip(robot, conditions, chassis, signals)
-    pull = mover.pull(chassis, signals)
-    return _side_signals(robot, chassis, signals, pull), pull
+    forces = mover.pull(chassis, signals)
+    return _side_signals(robot, chassis, signals, forces), forces
 
 
-def _side_signals(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signals:
+def _side_signals(robot: Robot, chassis: Chassis, signals: Signals, forces: Any) -> Signals:
     """Signals of one side whose sliding is known, with the forces of its contacts."""
-    traction, guide = pull.traction, jnp.sum(pull.guide)
+    traction = forces.traction
+    guide = jnp.sum(forces.guide)
     signals = track(robot, chassis, _traction_and_net_force(robot, signals, traction), guide)
-    return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius)
+    return gearbox(robot, chassis, signals, forces.load - guide * chassis.radius)
 
 
 def resolved_sides(
@@ -614,11 +636,11 @@ def resolved_sides(
     """
     robot = robot.within(conditions.configuration)
     chassis = replace(robot.chassis(conditions.configuration), inertia=inertia)
-    sides = conditions.of_sides()
-    signals = _fill_unset(_begin_sides(robot, conditions, sides, motion), normal=mover.normal)
-    signals = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(sides, signals)
-    pull = mover.pull(chassis, signals)
-    return jax.vmap(lambda s, p: _side_signals(robot, chassis, s, p))(signals, pull), pull
+    side_conditions = conditions.of_sides()
+    signals = _fill_unset(_begin_sides(robot, conditions, side_conditions, motion), normal=mover.normal)
+    signals = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(side_conditions, signals)
+    forces = mover.pull(chassis, signals)
+    return jax.vmap(lambda s, f: _side_signals(robot, chassis, s, f))(signals, forces), forces
 
 
 def driven_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
@@ -656,10 +678,10 @@ def settled_signals(
     zero = jnp.zeros_like(signals.demand)
     signals = _fill_unset(signals, traction=signals.demand, acceleration=zero)
     if isinstance(chassis, Shaft):
-        creep = zero
+        creep_speed = zero
     else:
-        creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
-    return gearbox(robot, chassis, track(robot, chassis, signals), settled=True), creep
+        creep_speed = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
+    return gearbox(robot, chassis, track(robot, chassis, signals), settled=True), creep_speed
 
 
 class Travel(eqx.Module):
@@ -686,14 +708,15 @@ def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar)
     The centre of mass includes all parts. Axles are one radius above the ground, on tracks a grouser height more.
     Levers with stated angles have the posture that they take on level ground.
     """
-    length, on_tracks = robot.running_gear.wheelbase, chassis.on_tracks
+    length = robot.running_gear.wheelbase
+    on_tracks = chassis.on_tracks
     if conditions.states_levers:
-        rests = resting_posture.level_posture(robot, conditions, mass)
-        length, on_tracks, height = rests.length, rests.line, rests.centre_height
-        centre_offset = rests.centre_ahead - (rests.front + rests.rear) / 2
+        posture = resting_posture.level_posture(robot, conditions, mass)
+        length, on_tracks, height = posture.length, posture.line, posture.centre_height
+        centre_offset = posture.centre_ahead - (posture.front + posture.rear) / 2
     else:
-        centre_offset, up = masses.masses_of_parts(robot, conditions, mass).centre
-        height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
+        centre_offset, centre_height = masses.masses_of_parts(robot, conditions, mass).centre
+        height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + centre_height
     return Stance(
         length=length,
         width=chassis.turning.width,
@@ -709,9 +732,10 @@ def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar)
 def states_of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> State:
     """States of left and right side, with a leading axis of 2. Each side travels at V_s = v_x - ω y_s."""
     speed = motion.speed - motion.yaw_rate * SIDES * robot.chassis(conditions.configuration).turning.width
-    none, discharge = jnp.zeros_like(speed), jnp.broadcast_to(motion.discharge, speed.shape)
+    zero = jnp.zeros_like(speed)
+    discharge = jnp.broadcast_to(motion.discharge, speed.shape)
     return State(
-        motion.current, motion.speed_motor, speed, discharge, motion.memory, motion.temperature, distance=none
+        motion.current, motion.speed_motor, speed, discharge, motion.memory, motion.temperature, distance=zero
     )
 
 
@@ -727,10 +751,12 @@ def _both_sides(x: Scalar) -> Array:
     return jnp.broadcast_to(x, SIDES.shape)
 
 
-def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: PlaneMotion) -> Signals:
-    """`begin_signals` of left and right side, with motion in the plane. `own` are the conditions of each side."""
+def _begin_sides(robot: Robot, conditions: Conditions, side_conditions: Conditions, motion: PlaneMotion) -> Signals:
+    """`begin_signals` of left and right side, with motion in the plane."""
     chassis = robot.chassis(conditions.configuration)
-    signals = jax.vmap(functools.partial(begin_signals, robot))(own, states_of_sides(robot, conditions, motion))
+    signals = jax.vmap(functools.partial(begin_signals, robot))(
+        side_conditions, states_of_sides(robot, conditions, motion)
+    )
     return _fill_unset(
         signals,
         total_current=_both_sides(sum_of_sides(signals.total_current) / 2),
@@ -746,11 +772,11 @@ def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: 
 def lateral_and_yaw_effects(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
     """Sums of the robot's effects in the balances `lateral` [N] and `yaw` [N·m], over both sides."""
 
-    def of(balance: str) -> Scalar:
+    def sum_in(balance: str) -> Scalar:
         effect_sums = _both_sides(jax.vmap(lambda s: effects_sum(robot, s, balance))(signals))
         return robot.sides / 2 * sum_of_sides(effect_sums)
 
-    return of("lateral"), of("yaw")
+    return sum_in("lateral"), sum_in("yaw")
 
 
 def turning_signals(
@@ -765,42 +791,51 @@ def turning_signals(
         loads: normal loads of both sides [N], see `GroundForceInputs.forces`.
     """
     robot = robot.within(conditions.configuration)
-    chassis, sides = robot.chassis(conditions.configuration), conditions.of_sides()
+    chassis = robot.chassis(conditions.configuration)
+    side_conditions = conditions.of_sides()
     y = SIDES * chassis.turning.width
-    signals = _begin_sides(robot, conditions, sides, motion)
-    sine_slope, mass = sine(conditions.slope), jnp.maximum(*signals.mass)
-    even = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(sides, signals)
-    rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
-    units = robot.sides / 2
-    stance_loads = stance(robot, conditions, chassis, mass)
-    load, sliding = sum_of_sides(units * even.normal), even.speed_sliding
+    signals = _begin_sides(robot, conditions, side_conditions, motion)
+    sine_slope = sine(conditions.slope)
+    mass = jnp.maximum(*signals.mass)
+    equally_loaded = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(side_conditions, signals)
+    rolling_coefficient = chassis.ground.force_resistance(1.0, equally_loaded.direction_travel)
+    motors_per_side = robot.sides / 2
+    robot_stance = stance(robot, conditions, chassis, mass)
+    total_load = sum_of_sides(motors_per_side * equally_loaded.normal)
+    sliding = equally_loaded.speed_sliding
     inputs = GroundForceInputs(
-        stance_loads, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral,
-        motion.yaw_rate, rolling,
+        robot_stance, chassis.ground.friction, conditions.adhesion, total_load, sliding, motion.speed_lateral,
+        motion.yaw_rate, rolling_coefficient,
     )  # fmt: skip
     contact_forces = inputs.forces(loads)
-    own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
-        _fill_unset(even, normal=contact_forces.normal / units, moment_lateral=contact_forces.moment / units)
+    loaded = jax.vmap(lambda s: travel(robot, chassis, s))(
+        _fill_unset(
+            equally_loaded,
+            normal=contact_forces.normal / motors_per_side,
+            moment_lateral=contact_forces.moment / motors_per_side,
+        )
     )
-    lateral, yaw = lateral_and_yaw_effects(robot, own_load)
-    pull = contact_forces.ahead - units * own_load.resistance
-    along = sum_of_sides(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
-    across = sum_of_sides(contact_forces.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
-    turn = (sum_of_sides(contact_forces.moment - y * pull) - yaw) / chassis.turning.inertia
-    acceleration = along / mass + motion.yaw_rate * motion.speed_lateral
-    pulled = _fill_unset(own_load, traction=contact_forces.ahead / units, acceleration=acceleration - turn * y)
-    pulled = jax.vmap(lambda s: track(robot, chassis, s))(pulled)
-    if sides.motor_speed is None:
-        pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
+    lateral, yaw = lateral_and_yaw_effects(robot, loaded)
+    net_forces = contact_forces.ahead - motors_per_side * loaded.resistance
+    force_along = sum_of_sides(net_forces) - mass * GRAVITY * sine_slope * cosine(motion.heading)
+    force_across = sum_of_sides(contact_forces.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
+    acceleration_yaw = (sum_of_sides(contact_forces.moment - y * net_forces) - yaw) / chassis.turning.inertia
+    acceleration = force_along / mass + motion.yaw_rate * motion.speed_lateral
+    driven = _fill_unset(
+        loaded, traction=contact_forces.ahead / motors_per_side, acceleration=acceleration - acceleration_yaw * y
+    )
+    driven = jax.vmap(lambda s: track(robot, chassis, s))(driven)
+    if side_conditions.motor_speed is None:
+        driven = jax.vmap(lambda s: gearbox(robot, chassis, s))(driven)
     else:
-        pulled = jax.vmap(lambda c, s: _signals_at_imposed_speed(robot, c, chassis, s))(sides, pulled)
-        pulled = _fill_unset(pulled, total_current=_both_sides(sum_of_sides(pulled.total_current) / 2))
+        driven = jax.vmap(lambda c, s: _signals_at_imposed_speed(robot, c, chassis, s))(side_conditions, driven)
+        driven = _fill_unset(driven, total_current=_both_sides(sum_of_sides(driven.total_current) / 2))
     return Travel(
-        pulled,
+        driven,
         contact_forces,
         acceleration,
-        across / mass - motion.yaw_rate * motion.speed,
-        turn,
+        force_across / mass - motion.yaw_rate * motion.speed,
+        acceleration_yaw,
     )
 
 
@@ -820,9 +855,9 @@ def readings_of_sides(robot: Robot, signals: Signals) -> Scalars:
 
     A channel of one side shows that side. The others show the mean.
     """
-    read = sensor(robot, signals)
+    readings = sensor(robot, signals)
     return {
-        c.name: jnp.mean(read[c.name], -1) if c.side is None else jnp.asarray(read[c.name])[..., c.side]
+        c.name: jnp.mean(readings[c.name], -1) if c.side is None else jnp.asarray(readings[c.name])[..., c.side]
         for c in channels.EVERY
     }
 
@@ -832,6 +867,6 @@ def mean_of_sides(signals: Signals) -> Signals:
     return jax.tree.map(lambda x: jnp.mean(x, axis=-1) if jnp.ndim(x) else x, signals)
 
 
-def signals_of(found: Signals | Travel) -> Signals:
+def signals_of(instant: Signals | Travel) -> Signals:
     """Signals of an instant. For a robot that turns, of left and right side."""
-    return found.signals if isinstance(found, Travel) else found
+    return instant.signals if isinstance(instant, Travel) else instant

@@ -45,18 +45,18 @@ def find_channel(name: str) -> Channel:
     return channels_named((name,))[0]
 
 
-def channel_names(shown: Iterable[Channel]) -> tuple[str, ...]:
+def channel_names(channels: Iterable[Channel]) -> tuple[str, ...]:
     """Names of the channels, in order."""
-    return tuple(c.name for c in shown)
+    return tuple(c.name for c in channels)
 
 
-def channel_index(name: str, shown: Iterable[Channel]) -> int:
-    """Position of a channel in arrays over the channels `shown`.
+def channel_index(name: str, channels: Iterable[Channel]) -> int:
+    """Position of a channel in arrays over the channels `channels`.
 
     Raises:
-        KeyError: `shown` does not contain the channel.
+        KeyError: `channels` does not contain the channel.
     """
-    names = channel_names(shown)
+    names = channel_names(channels)
     if name not in names:
         raise KeyError(f"no channel {name}; there are {', '.join(names)}")
     return names.index(name)

@@ -48,11 +48,12 @@ class NamedConfigurations(eqx.Module):
     def of(words: np.ndarray) -> NamedConfigurations:
         """Encodes an array of names."""
         # one name for all runs, as `Conditions` broadcasts it, is looked up once
-        once = np.asarray(words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)])
-        index, names = np.full(once.shape, -1, np.int32), list[str]()
+        unrepeated = np.asarray(words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)])
+        index = np.full(unrepeated.shape, -1, np.int32)
+        names = list[str]()
         while (unmatched := index < 0).any():
-            names.append(str(once[unmatched][0]))
-            index[once == names[-1]] = len(names) - 1
+            names.append(str(unrepeated[unmatched][0]))
+            index[unrepeated == names[-1]] = len(names) - 1
         return NamedConfigurations(np.broadcast_to(index, words.shape), tuple(names))
 
     @property
@@ -66,12 +67,12 @@ class NamedConfigurations(eqx.Module):
         Raises:
             KeyError: a run has a name that is not in the sequence, or any name if the conditions are traced.
         """
-        places = np.array([names.index(name) if name in names else -1 for name in self.names], int)
+        positions = np.array([names.index(name) if name in names else -1 for name in self.names], int)
         traced = isinstance(self.index, jax.core.Tracer)
-        for k in np.flatnonzero(places < 0):
+        for k in np.flatnonzero(positions < 0):
             if traced or (np.asarray(self.index) == k).any():
                 raise KeyError(self.names[k])
-        return jnp.asarray(places)[self.index] if traced else np.asarray(places[np.asarray(self.index)])
+        return jnp.asarray(positions)[self.index] if traced else np.asarray(positions[np.asarray(self.index)])
 
 
 class Conditions(eqx.Module):
@@ -190,8 +191,8 @@ class Conditions(eqx.Module):
         try:
             shape = np.broadcast_shapes(*shapes.values())
         except ValueError:
-            shape_words = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
-            raise ValueError(f"Conditions: shapes do not broadcast to one another: {shape_words}") from None
+            shape_list = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
+            raise ValueError(f"Conditions: shapes do not broadcast to one another: {shape_list}") from None
         self.configuration = jax.tree.map(lambda x: _broadcast_array(x, shape), configurations)
         self.begin = None if begin is None else _broadcast_array(_number_array("begin", begin, int), shape)
         # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
@@ -231,8 +232,8 @@ class Conditions(eqx.Module):
 
     def straight(self) -> Conditions:
         """Same conditions without any that belong to one side, heading uphill."""
-        alike: dict[str, Any] = dict.fromkeys(OF_TURNS)
-        return replace(self, **alike)
+        unset: dict[str, Any] = dict.fromkeys(OF_TURNS)
+        return replace(self, **unset)
 
     def of_sides(self) -> Conditions:
         """Conditions of left and right side, with a leading axis of 2."""

@@ -88,7 +88,8 @@ class Friction(eqx.Module):
 
     def rise(self, speed: Scalar) -> Array:
         """Derivative of the coefficient with respect to sliding `speed` [s/m]. Negative between V_s and V_d."""
-        size, width = jnp.abs(speed), self.speed_dynamic - self.speed_static
+        size = jnp.abs(speed)
+        width = self.speed_dynamic - self.speed_static
         u = jnp.clip((size - self.speed_static) / width, 0.0, 1.0)
         x = jnp.clip(speed / self.speed_static, -1.0, 1.0)
         rising = self.static * 1.5 * (1 - x**2) / self.speed_static

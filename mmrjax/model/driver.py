@@ -60,13 +60,13 @@ class Driver(eqx.Module):
 
     def unlimited(self) -> Driver:
         """Same driver without limit and diode."""
-        without: dict[str, Any] = {"current_limit": None, "returns_current": True}
-        return replace(self, **without)
+        changes: dict[str, Any] = {"current_limit": None, "returns_current": True}
+        return replace(self, **changes)
 
-    def voltage(self, source: Scalar, duty: Scalar, pause: Scalar, back: Scalar) -> Scalar:
-        """Mean voltage at the motors [V]. `pause`: share of a period without pulses [-]. `back`: back-EMF E [V]."""
+    def voltage(self, source: Scalar, duty: Scalar, pause: Scalar, back_emf: Scalar) -> Scalar:
+        """Mean voltage at the motors [V]. `pause`: share of a period without pulses [-]. `back_emf`: E [V]."""
         pulses = duty * source
-        return pulses + pause * back if self.decay == FAST else pulses
+        return pulses + pause * back_emf if self.decay == FAST else pulses
 
     def share_drawn(self, duty: Scalar) -> Scalar:
         """Share of the motors' mean current that the supply gives, I_s / I [-]."""
@@ -94,7 +94,7 @@ class Driver(eqx.Module):
         return jnp.abs(current) > self.current_limit
 
     def conducts(
-        self, duty: Scalar, limited: Scalar, current: Scalar, excess: Scalar, open_circuit: Scalar
+        self, duty: Scalar, limited_duty: Scalar, current: Scalar, excess: Scalar, open_circuit: Scalar
     ) -> Scalar:
         """Share of time in which the driver's voltage is at the motors [-], else they are free, at the back-EMF E.
 
@@ -104,20 +104,22 @@ class Driver(eqx.Module):
 
         Args:
             duty: demanded [-], with the sign of the voltage that it gives.
-            limited: duty after the current limit [-].
+            limited_duty: duty after the current limit [-].
             current: current of a motor [A].
             excess: the driver's voltage less E [V].
         """
         closed = jnp.where(jnp.asarray(open_circuit) > 0.5, 0.0, 1.0)
         if self.returns_current:
             return closed
-        drawn = jnp.sign(duty) * current / CURRENT_DIODE
-        diode = jnp.where(jnp.sign(duty) * excess < 0, clip(drawn, -1.0, 1.0), clip(1 + drawn, 0.0, 1.0))
-        backward = (limited * current < 0) & (duty * current >= 0)
-        return closed * jnp.where(backward, clip(1 - jnp.abs(limited) / DUTY_DIODE, 0.0, 1.0), diode)
+        relative_current = jnp.sign(duty) * current / CURRENT_DIODE
+        diode_share = jnp.where(
+            jnp.sign(duty) * excess < 0, clip(relative_current, -1.0, 1.0), clip(1 + relative_current, 0.0, 1.0)
+        )
+        reverses = (limited_duty * current < 0) & (duty * current >= 0)
+        return closed * jnp.where(reverses, clip(1 - jnp.abs(limited_duty) / DUTY_DIODE, 0.0, 1.0), diode_share)
 
-    def admitted(self, wanted: Scalar, duty: Scalar, most: Scalar) -> tuple[Scalar, Scalar]:
-        """Current that flows [A], and the part of `wanted` that a diode holds back [A].
+    def admitted(self, unlimited_current: Scalar, duty: Scalar, source_current: Scalar) -> tuple[Scalar, Scalar]:
+        """Current that flows [A], and the part of `unlimited_current` that a diode holds back [A].
 
         Limit and diode as a curve over the current that the demanded duty alone would drive. Along it the voltage
         available to change the current falls evenly, so that Newton's method crosses them. With over = |wanted| less
@@ -125,24 +127,27 @@ class Driver(eqx.Module):
         Beyond, the current increases again. With a diode, the duty is not reversed and the current does not increase.
 
         Args:
-            wanted: any number.
+            unlimited_current: any number.
             duty: as for `conducts`.
-            most: |U_s|/R, or any number above 0 if it has no source [A].
+            source_current: |U_s|/R, or any number above 0 if it has no source [A].
         """
         if self.current_limit is None:
-            return wanted, jnp.zeros_like(wanted)
-        way, limit = jnp.where(wanted < 0, -1.0, 1.0), self.current_limit
-        forward_duty = way * duty
-        excess, step = at_least(jnp.abs(wanted) - limit, 0.0), limit / STEEPNESS
+            return unlimited_current, jnp.zeros_like(unlimited_current)
+        sign = jnp.where(unlimited_current < 0, -1.0, 1.0)
+        limit = self.current_limit
+        forward_duty = sign * duty
+        excess = at_least(jnp.abs(unlimited_current) - limit, 0.0)
+        limit_step = limit / STEEPNESS
         reduction = at_most(
-            excess / (most + step), 1 + forward_duty if self.returns_current else at_least(forward_duty, 0.0)
+            excess / (source_current + limit_step),
+            1 + forward_duty if self.returns_current else at_least(forward_duty, 0.0),
         )
-        beyond = excess - reduction * (most + step)
-        current = at_most(jnp.abs(wanted), limit) + reduction * step
+        excess_beyond = excess - reduction * (source_current + limit_step)
+        current = at_most(jnp.abs(unlimited_current), limit) + reduction * limit_step
         if self.returns_current:
-            return way * (current + beyond), jnp.zeros_like(beyond)
-        current = jnp.where(forward_duty < 0, 0.0, way * current)
-        return current, jnp.where(forward_duty < 0, wanted, way * beyond)
+            return sign * (current + excess_beyond), jnp.zeros_like(excess_beyond)
+        current = jnp.where(forward_duty < 0, 0.0, sign * current)
+        return current, jnp.where(forward_duty < 0, unlimited_current, sign * excess_beyond)
 
     def demand(self, error: Scalar, integral: Scalar, speed: Scalar, constant: Scalar) -> Scalar:
         """Voltage [V] of the speed controller: PI with the back-EMF fed forward.
@@ -166,9 +171,9 @@ class Controller(eqx.Module):
     """Proportional, integral and derivative action on a goal, and a feed-forward, within a limit.
 
     D = K_p e + K_i ∫ e dt - K_d dx/dt + K_f g, with e = g - x, |D| <= D_max. While D is at the limit, an error that
-    drives it further is not integrated. x is the angle or the speed of the output, or the current of the motor. dx/dt
-    acts where x is an angle, K_f g where it is not. The duty follows D with a lag. With a `rate`, the controller
-    reads x and g at each multiple of its period T, adds T e to the integral, and holds D until the next sample.
+    drives it further is not integrated. The controlled x is the angle or the speed of the output, or the current of
+    the motor. K_d acts if x is an angle, K_f if it is not. The duty follows D with a lag. With a `rate`, the
+    controller reads x and g once per period T and adds T e to the integral. It holds D until the next sample.
 
     Attributes:
         lags: True if the lag is more than 0, so that the duty is a state.
@@ -217,5 +222,5 @@ class Controller(eqx.Module):
             speed: dx/dt of an angle [rad/s], else 0.
             goal: g of a speed or a current, else 0.
         """
-        demanded_voltage = self.kp * error + self.ki * integral - self.kd * speed + self.feed_forward * goal
-        return clip(demanded_voltage, -self.limit, self.limit)
+        demanded_duty = self.kp * error + self.ki * integral - self.kd * speed + self.feed_forward * goal
+        return clip(demanded_duty, -self.limit, self.limit)

@@ -31,18 +31,20 @@ def sink_powers(robot: Robot, conditions: Conditions, signals: Signals) -> Scala
 
     Together with the change of the energy `stored_energy` they add up to `source_power` at each instant.
     """
-    sides, battery, on_battery = robot.sides, robot.battery, conditions.battery > 0.5
-    load = battery.current(signals.total_current)
+    sides = robot.sides
+    battery = robot.battery
+    on_battery = conditions.battery > 0.5
+    battery_current = battery.current(signals.total_current)
     torque_out = signals.torque_load - signals.torque_track_loss  # at the wheel: ground, and effects of the gearbox
-    ground = signals.traction * signals.speed_theoretical
-    into = signals.torque_input * signals.speed_motor - signals.torque_gear * signals.speed_wheel
+    traction_power = signals.traction * signals.speed_theoretical
+    mesh_loss = signals.torque_input * signals.speed_motor - signals.torque_gear * signals.speed_wheel
     return {
-        "battery": jnp.where(on_battery, battery.cells * battery.resistance * load**2, 0.0),
+        "battery": jnp.where(on_battery, battery.cells * battery.resistance * battery_current**2, 0.0),
         "other": jnp.where(on_battery, battery.current_other * signals.voltage_source, 0.0),
         "driver": signals.voltage_source * signals.total_current - power_drawn(robot, signals),
         "winding": sides * signals.voltage_drop * signals.current * robot.driver.ripple(signals.duty),
         "motor": sides * signals.torque_motor_loss * signals.speed_motor,
-        "gearbox": sides * (into + torque_out * signals.speed_wheel - ground),
+        "gearbox": sides * (mesh_loss + torque_out * signals.speed_wheel - traction_power),
         "track": sides * signals.torque_track_loss * signals.speed_wheel,
         "sliding": sides * signals.traction * (signals.speed_theoretical - signals.speed),
         "rolling": sides * signals.resistance * signals.speed,
@@ -62,15 +64,15 @@ def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) ->
     """Same as `sink_powers` for a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
     signals = travel.signals
     powers_of_sides = jax.vmap(lambda c, s: sink_powers(robot, c, s))(conditions.of_sides(), signals)
-    means: Scalars = {name: jnp.mean(power) for name, power in powers_of_sides.items()}
-    weight = jnp.mean(signals.mass) * GRAVITY * sine(conditions.slope)
-    across = jnp.mean(signals.speed_lateral) * sine(jnp.mean(signals.heading))
-    means["sliding"] = means["sliding"] + jnp.sum(travel.grip.across)
+    powers: Scalars = {name: jnp.mean(power) for name, power in powers_of_sides.items()}
+    downhill_force = jnp.mean(signals.mass) * GRAVITY * sine(conditions.slope)
+    speed_aside = jnp.mean(signals.speed_lateral) * sine(jnp.mean(signals.heading))
+    powers["sliding"] = powers["sliding"] + jnp.sum(travel.grip.lateral_power)
     for balance, rate in (("lateral", signals.speed_lateral), ("yaw", signals.yaw_rate)):
         effect_terms = jax.vmap(lambda s, balance=balance: effects_sum(robot, s, balance) * jnp.ones(()))(signals)
-        means["sliding"] = means["sliding"] + robot.sides / 2 * jnp.sum(effect_terms * rate)
-    means["lift"] = means["lift"] - weight * across
-    return means
+        powers["sliding"] = powers["sliding"] + robot.sides / 2 * jnp.sum(effect_terms * rate)
+    powers["lift"] = powers["lift"] - downhill_force * speed_aside
+    return powers
 
 
 def stored_energy_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
@@ -78,5 +80,5 @@ def stored_energy_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> 
     signals = replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
     turning = robot.chassis(jnp.max(signals.configuration)).turning
     mean_energy = jnp.mean(jax.vmap(lambda s: stored_energy(robot, s))(signals))
-    across = jnp.mean(signals.mass) * motion.speed_lateral**2
-    return mean_energy + 0.5 * (across + turning.inertia * motion.yaw_rate**2)
+    mass_speed_squared = jnp.mean(signals.mass) * motion.speed_lateral**2
+    return mean_energy + 0.5 * (mass_speed_squared + turning.inertia * motion.yaw_rate**2)

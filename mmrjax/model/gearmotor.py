@@ -110,18 +110,18 @@ class Motor(eqx.Module):
         T = T_a + R_th R I² (1 + α (T - 25 °C)). It is inf if R_th R I² α >= 1.
         """
         rise = self.resistance_thermal * self.resistance * current**2
-        heating_left = 1 - self.temperature_coefficient * rise
-        finite = heating_left > 0
+        denominator = 1 - self.temperature_coefficient * rise
+        finite = denominator > 0
         ratio = self.resistance_ratio(self.temperature_ambient)
-        settled = self.temperature_ambient + rise * ratio / jnp.where(finite, heating_left, 1.0)
+        settled = self.temperature_ambient + rise * ratio / jnp.where(finite, denominator, 1.0)
         return jnp.where(finite, settled, jnp.inf)
 
     @property
     def current_continuous(self) -> Scalar:
         """Current with a final winding temperature at the permissible limit [A], with the rise of its resistance."""
-        allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
+        rise_allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
         hot_resistance = self.resistance * self.resistance_ratio(self.temperature_limit)
-        return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot_resistance, 1e-9))
+        return jnp.sqrt(rise_allowed / jnp.maximum(self.resistance_thermal * hot_resistance, 1e-9))
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
         """Rates of the temperatures of winding and housing [K/s], two thermal masses in series.
@@ -133,11 +133,11 @@ class Motor(eqx.Module):
             power: lost in the winding [W].
             winding, housing: temperatures [°C].
         """
-        flow = (winding - housing) / self.resistance_thermal_winding
+        heat_to_housing = (winding - housing) / self.resistance_thermal_winding
         heat_to_ambient = (housing - self.temperature_ambient) / self.resistance_thermal_housing
         return (
-            (power - flow) * self.resistance_thermal_winding / self.time_constant_winding,
-            (flow - heat_to_ambient) * self.resistance_thermal_housing / self.time_constant_housing,
+            (power - heat_to_housing) * self.resistance_thermal_winding / self.time_constant_winding,
+            (heat_to_housing - heat_to_ambient) * self.resistance_thermal_housing / self.time_constant_housing,
         )
 
     def temperatures_after(
@@ -167,8 +167,8 @@ class Motor(eqx.Module):
         """
         ambient, limit = self.temperature_ambient, self.temperature_limit
 
-        def excess(time: Scalar, held: tuple[Motor, Scalar]) -> Array:
-            motor, current = held
+        def excess(time: Scalar, motor_and_current: tuple[Motor, Scalar]) -> Array:
+            motor, current = motor_and_current
             begin = motor.temperature_ambient, motor.temperature_ambient
             temperature_excess = motor.temperatures_after(current, time, *begin)[0] - motor.temperature_limit
             return jnp.where(jnp.isfinite(temperature_excess), temperature_excess, jnp.inf)
@@ -176,7 +176,7 @@ class Motor(eqx.Module):
         bounds = {"lower": math.log(_SHORT), "upper": math.log(_LONG)}
         inputs = jax.lax.stop_gradient((self, current))
         solution: optx.Solution = optx.root_find(
-            lambda log_time, held: excess(jnp.exp(log_time), held),
+            lambda log_time, motor_and_current: excess(jnp.exp(log_time), motor_and_current),
             optx.Bisection(rtol=0.0, atol=0.0, flip=False),  # type: ignore[call-arg]  # its norm is no field
             jnp.asarray(sum(bounds.values()) / 2),
             inputs,
@@ -186,12 +186,12 @@ class Motor(eqx.Module):
         )
         seconds = jax.lax.stop_gradient(jnp.exp(solution.value))
         # The Newton step from here changes no value; it carries the derivative.
-        hot, around = self.temperatures_after(current, seconds, ambient, ambient)
-        rise = self.heating(self.voltage_winding(current, hot) * current, hot, around)[0]
-        rises = jnp.isfinite(hot) & (rise > 0)
-        seconds = seconds - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
-        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG), inputs) > 0)
-        return jnp.where(jnp.asarray(ambient) >= limit, 0.0, jnp.where(ever, seconds, jnp.inf))
+        winding, housing = self.temperatures_after(current, seconds, ambient, ambient)
+        heating_rate = self.heating(self.voltage_winding(current, winding) * current, winding, housing)[0]
+        heats = jnp.isfinite(winding) & (heating_rate > 0)
+        seconds = seconds - jnp.where(heats, (winding - limit) / jnp.where(heats, heating_rate, 1.0), 0.0)
+        reaches_limit = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG), inputs) > 0)
+        return jnp.where(jnp.asarray(ambient) >= limit, 0.0, jnp.where(reaches_limit, seconds, jnp.inf))
 
 
 #: Torque below which the gearbox counts as unloaded, so that rounding does not decide the direction of power [N·m].
@@ -252,8 +252,8 @@ class Gearbox(eqx.Module):
         `transmitted` is the input torque less the idle torque [N·m]. If it is 0, the efficiency is that of a small
         load: power flows to the wheels.
         """
-        way = jnp.where(jnp.abs(transmitted) > NO_TORQUE, jnp.sign(transmitted), jnp.sign(direction))
-        flow = way * direction
+        torque_sign = jnp.where(jnp.abs(transmitted) > NO_TORQUE, jnp.sign(transmitted), jnp.sign(direction))
+        flow = torque_sign * direction
         return 1 + flow * jnp.where(flow >= 0, self.efficiency_load - 1, 1 - 1 / self.efficiency_backward)
 
     def torque_output(self, transmitted: Scalar, direction: Scalar) -> Scalar:
@@ -266,8 +266,8 @@ class Gearbox(eqx.Module):
 
     def torque_loss(self, torque_input: Scalar, speed: Scalar) -> Scalar:
         """Total loss at the output M_rf [N·m], eq. (22), driving forward."""
-        load = torque_input * self.ratio * (1 - self.efficiency_load)
-        return load + self.torque_idle(speed, 1.0) * self.ratio * self.efficiency_load
+        load_loss = torque_input * self.ratio * (1 - self.efficiency_load)
+        return load_loss + self.torque_idle(speed, 1.0) * self.ratio * self.efficiency_load
 
 
 def slow_output_torque(motor: Motor, gearbox: Gearbox, current: float) -> float:

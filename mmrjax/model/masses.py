@@ -45,7 +45,7 @@ class HalfRobotMasses(eqx.Module):
         share = self.chassis / (self.chassis + 2 * self.pulley)
         return share * self.forward, share * self.up
 
-    def pitching(self, wheelbase: Scalar) -> Scalar:
+    def inertia_about_middle(self, wheelbase: Scalar) -> Scalar:
         """Moment of inertia in pitch of all parts about the middle of the wheelbase [kg·m²].
 
         Pulleys do not turn on their axles. Their own inertia J about the axles is not included.
@@ -54,8 +54,9 @@ class HalfRobotMasses(eqx.Module):
 
     def inertia_pitch(self, wheelbase: Scalar) -> Scalar:
         """Moment of inertia in pitch of half a robot about its centre [kg·m²]."""
-        total, moment = self.chassis + 2 * self.pulley, self.chassis**2 * (self.forward**2 + self.up**2)
-        return self.pitching(wheelbase) + 2 * self.inertia_pulley - moment / total
+        total = self.chassis + 2 * self.pulley
+        moment_squared = self.chassis**2 * (self.forward**2 + self.up**2)
+        return self.inertia_about_middle(wheelbase) + 2 * self.inertia_pulley - moment_squared / total
 
 
 class _RigidPart(NamedTuple):
@@ -78,12 +79,12 @@ def _joined_parts(parts: list[_RigidPart]) -> _RigidPart:
 
 def _belt_part(gear: RunningGear, radius: Scalar) -> _RigidPart:
     """A main track round its pulleys. Its inertia is reduced by m r², which is in J_w and turns with the pulleys."""
-    base, mass = gear.wheelbase, gear.belt_mass
-    straights = 2 * base * (base**2 / 12 + radius**2)
-    arcs = 2 * radius * (jnp.pi * base**2 / 4 + 2 * base * radius + jnp.pi * radius**2)
-    loop = mass * (straights + arcs) / (2 * base + 2 * jnp.pi * radius)
+    wheelbase, mass = gear.wheelbase, gear.belt_mass
+    straights = 2 * wheelbase * (wheelbase**2 / 12 + radius**2)
+    arcs = 2 * radius * (jnp.pi * wheelbase**2 / 4 + 2 * wheelbase * radius + jnp.pi * radius**2)
+    inertia = mass * (straights + arcs) / (2 * wheelbase + 2 * jnp.pi * radius)
     zero_mass = jnp.zeros_like(mass)
-    return _RigidPart(mass, zero_mass, zero_mass, loop - mass * radius**2)
+    return _RigidPart(mass, zero_mass, zero_mass, inertia - mass * radius**2)
 
 
 def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Scalar]:
@@ -100,10 +101,17 @@ def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Sca
 
 def _lever_parts(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> list[_RigidPart]:
     """The levers of one side at their angles [rad], see `lever_angles`."""
-    mass, inertia, half = gear.lever_mass * tracked, gear.lever_inertia * tracked, gear.wheelbase / 2
-    along = gear.lever_centre
+    mass = gear.lever_mass * tracked
+    inertia = gear.lever_inertia * tracked
+    half_wheelbase = gear.wheelbase / 2
+    centre_distance = gear.lever_centre
     return [
-        _RigidPart(mass, side * (half + along * jnp.cos(angle)), along * jnp.sin(angle), inertia)
+        _RigidPart(
+            mass,
+            side * (half_wheelbase + centre_distance * jnp.cos(angle)),
+            centre_distance * jnp.sin(angle),
+            inertia,
+        )
         for side, angle in ((1.0, front), (-1.0, rear))
     ]
 
@@ -129,17 +137,18 @@ def _parts_of_robot(
     robot: Robot, conditions: Conditions, mass: Scalar
 ) -> tuple[list[_RigidPart], list[_RigidPart], Scalar, Scalar, Scalar]:
     """Parts fixed in the chassis, levers, mass of the body, mass and inertia of the parts that turn on an axle."""
-    kind, gear = robot.chassis(conditions.configuration), robot.running_gear
-    tracked = kind.on_tracks
+    chassis = robot.chassis(conditions.configuration)
+    gear = robot.running_gear
+    tracked = chassis.on_tracks
     wheeled = 1 - tracked
     pulley = gear.pulley_mass + gear.additional_pulley_mass + gear.wheel_mass * wheeled
-    inertia_pulley = kind.inertia / 2
+    inertia_pulley = chassis.inertia / 2
     belt = _belt_part(gear, robot.radius_pulley)
     levers = _lever_parts(gear, tracked, *lever_angles(gear, conditions))
     zero_mass = jnp.zeros_like(belt.mass)
     payload = _RigidPart(conditions.payload / robot.sides, gear.payload_offset, gear.payload_height, zero_mass)
-    weighs = mass / robot.sides - 2 * pulley - belt.mass - sum(p.mass for p in levers) - payload.mass
-    body = _RigidPart(weighs, gear.centre_offset, gear.centre_height, weighs * gear.body_gyration**2)
+    body_mass = mass / robot.sides - 2 * pulley - belt.mass - sum(p.mass for p in levers) - payload.mass
+    body = _RigidPart(body_mass, gear.centre_offset, gear.centre_height, body_mass * gear.body_gyration**2)
 
     pulleys = [_RigidPart(pulley, side * gear.wheelbase / 2, zero_mass, inertia_pulley) for side in (1.0, -1.0)]
     folded = [
@@ -148,9 +157,9 @@ def _parts_of_robot(
         *_lever_parts(gear, tracked, jnp.pi, jnp.pi),
         *pulleys,
     ]
-    inertia = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
-    inertia_left = inertia - _joined_parts(folded).inertia
-    body = body._replace(inertia=jnp.where(inertia_left > 0, inertia_left, body.inertia))
+    stated_inertia = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
+    body_inertia = stated_inertia - _joined_parts(folded).inertia
+    body = body._replace(inertia=jnp.where(body_inertia > 0, body_inertia, body.inertia))
 
     return [body, belt, payload], levers, body.mass, pulley, inertia_pulley
 
@@ -161,23 +170,25 @@ def check_parts(robot: Robot) -> None:
     Raises:
         ValueError: the parts weigh as much as a configuration, or have more inertia than stated for the whole.
     """
-    without = {"body_gyration": 0.0, "inertia_tracked": 0.0, "inertia_wheeled": 0.0}
-    folded = {"lever_front": np.pi, "lever_rear": 0.0}
-    gear = params.replace(robot.running_gear, {name: jnp.asarray(x) for name, x in (without | folded).items()})
+    no_inertia = {"body_gyration": 0.0, "inertia_tracked": 0.0, "inertia_wheeled": 0.0}
+    folded_levers = {"lever_front": np.pi, "lever_rear": 0.0}
+    gear = params.replace(
+        robot.running_gear, {name: jnp.asarray(x) for name, x in (no_inertia | folded_levers).items()}
+    )
     bodiless = replace(robot, running_gear=gear)
     for k, (name, chassis) in enumerate(robot.configurations.items()):
-        half = masses_of_parts(bodiless, Conditions(k).resolved(robot), chassis.mass)
-        if np.any(np.asarray(half.body) <= 0):
-            parts = np.max(np.asarray(chassis.mass - robot.sides * half.body))
+        masses = masses_of_parts(bodiless, Conditions(k).resolved(robot), chassis.mass)
+        if np.any(np.asarray(masses.body) <= 0):
+            parts_mass = np.max(np.asarray(chassis.mass - robot.sides * masses.body))
             raise ValueError(
-                f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, "
-                "the mass of its pulleys, wheels, tracks and levers (running_gear)"
+                f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than "
+                f"{parts_mass:.3g} kg, the mass of its pulleys, wheels, tracks and levers (running_gear)"
             )
         total_field = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
         declared_total = np.asarray(getattr(robot.running_gear, total_field))
-        least = np.asarray(robot.sides * half.inertia_pitch(gear.wheelbase))
-        if np.any((declared_total > 0) & (declared_total <= least)):
+        parts_inertia = np.asarray(robot.sides * masses.inertia_pitch(gear.wheelbase))
+        if np.any((declared_total > 0) & (declared_total <= parts_inertia)):
             raise ValueError(
                 f"running_gear.{total_field}: got {np.min(declared_total):.3g} kg·m^2; expected 0, or more than "
-                f"{np.max(least):.3g} kg·m^2, that of the parts of {name} without the body's own"
+                f"{np.max(parts_inertia):.3g} kg·m^2, that of the parts of {name} without the body's own"
             )

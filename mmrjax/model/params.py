@@ -80,7 +80,7 @@ def parameter(
 
 
 def as_float(value: Any) -> Any:
-    """A number as a float array (`precision.as_array`). An array passes without its weak type."""
+    """A number as a float array (`compiling.as_array`). An array passes without its weak type."""
     if isinstance(value, int | float):
         return as_array(value)
     # A weakly typed array, as from `jnp.asarray(0.5)`, would make every function compile another program. A tracer
@@ -198,15 +198,15 @@ def replace(component: M, values: dict[str, Any]) -> M:
     names = [p.name for p in walk_parameters(component)]
     unknown = sorted(set(values) - set(names))
     if unknown:
-        meant = [similar_words(name, names, 3) for name in unknown]
-        hints = [f"{n} (did you mean {', '.join(m)}?)" if m else n for n, m in zip(unknown, meant, strict=True)]
+        suggestions = [similar_words(name, names, 3) for name in unknown]
+        hints = [f"{n} (did you mean {', '.join(m)}?)" if m else n for n, m in zip(unknown, suggestions, strict=True)]
         raise KeyError(f"no such parameter: {', '.join(hints)}")
     replaced = _replace_below(component, values, "")
     rig: Any = getattr(replaced, "rig", None)
     if rig is None or values.keys().isdisjoint(rig.unknown):
         return replaced
-    names = dataclasses.replace(rig, unknown=tuple(name for name in rig.unknown if name not in values))
-    changes: dict[str, Any] = {"rig": names}
+    rig = dataclasses.replace(rig, unknown=tuple(name for name in rig.unknown if name not in values))
+    changes: dict[str, Any] = {"rig": rig}
     return dataclasses.replace(replaced, **changes)
 
 

@@ -55,22 +55,22 @@ class Battery(eqx.Module):
 
     def voltage_no_load(self, discharge: Scalar) -> Scalar:
         """No-load voltage of one cell [V] after `discharge` [C], eq. (13)."""
-        curve_value = self._on_curve(discharge)
-        return self.curvature * curve_value**2 + self.slope * curve_value + self.voltage_full
+        curve_charge = self._charge_on_curve(discharge)
+        return self.curvature * curve_charge**2 + self.slope * curve_charge + self.voltage_full
 
-    def _on_curve(self, discharge: Scalar) -> Scalar:
+    def _charge_on_curve(self, discharge: Scalar) -> Scalar:
         """Charge q [C] that discharges a cell of capacity C_n by the same share."""
         return discharge * (self.capacity_curve / self.capacity)
 
     def rises(self, discharge: Scalar) -> Bool[Array, "..."]:
         """True if the no-load voltage rises with further discharge, beyond the minimum of eq. (13)."""
-        return jnp.asarray(2 * self.curvature * self._on_curve(discharge) + self.slope > 0)
+        return jnp.asarray(2 * self.curvature * self._charge_on_curve(discharge) + self.slope > 0)
 
     def energy(self, discharge: Scalar) -> Scalar:
         """Energy given by the whole battery at no-load voltage [J] after `discharge` [C]: integral of eq. (13)."""
-        curve_value = self._on_curve(discharge)
-        per_charge = (self.curvature / 3 * curve_value + self.slope / 2) * curve_value + self.voltage_full
-        return self.cells * per_charge * discharge
+        curve_charge = self._charge_on_curve(discharge)
+        mean_voltage = (self.curvature / 3 * curve_charge + self.slope / 2) * curve_charge + self.voltage_full
+        return self.cells * mean_voltage * discharge
 
     def current(self, total_current: Scalar) -> Scalar:
         """Load current of the battery I_b = I_s + I_p [A], eq. (10), also dC_b/dt, eq. (11)."""
@@ -113,8 +113,8 @@ def cutoff_remark(battery: Battery) -> str | None:
     cutoff, empty, resistance = battery.voltage_cutoff, float(battery.voltage_empty), float(battery.resistance)
     if cutoff >= empty or cutoff == Battery.voltage_cutoff:
         return None
-    effect_words = f"it acts only beyond {(empty - cutoff) / resistance:.3g} A" if resistance > 0 else "it never acts"
-    return f"{cutoff:g} V is below the {empty:.3g} V of an empty cell without load: {effect_words}"
+    consequence = f"it acts only beyond {(empty - cutoff) / resistance:.3g} A" if resistance > 0 else "it never acts"
+    return f"{cutoff:g} V is below the {empty:.3g} V of an empty cell without load: {consequence}"
 
 
 def curve_remark(battery: Battery) -> str | None:

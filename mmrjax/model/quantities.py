@@ -1,8 +1,8 @@
 """The table of quantities: everything that has a name, a unit and a range. Importable without jax.
 
-`TABLE` has one row for each label, condition, channel, output and requirement, under the heading of where it may
-stand. Columns of tables and profiles, options, results, stores, pages and `explain` read these rows. A new channel is
-one row, a new condition a row and a field of `Conditions`, a new output a row and the function that computes it.
+`TABLE` has one row for each label, condition, channel, output and requirement, grouped by place of use.
+Columns of tables and profiles, options, results, stores, pages and `explain` read these rows. A new channel is one
+row, a new condition a row and a field of `Conditions`, a new output a row and the function that computes it.
 """
 
 from __future__ import annotations
@@ -66,14 +66,14 @@ def unit_in_column(unit: str) -> str:
     return unit.replace("/", "_").replace("%", PERCENT).replace("·", "")
 
 
-def unit_at_end(text: str, known: Iterable[str]) -> str | None:
-    """Unit among `known` at the end of a column's name, such as kNm of `torque_kNm`, `Torque [kN·m]`, or None."""
-    end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
-    last = re.split(r"[^A-Za-z/]", end)[-1]
-    written = unit_in_column(last) if len(last) > 1 else ""
-    end = unit_in_column(end)
-    units = [u for u in known if u and (u == written or re.search(rf"(?:^|[^A-Za-z]){u}$", end))]
-    return max(units, key=len, default=None)
+def unit_at_end(text: str, allowed: Iterable[str]) -> str | None:
+    """Unit among `allowed` at the end of a column's name, such as kNm of `torque_kNm`, `Torque [kN·m]`, or None."""
+    ending = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
+    letters = re.split(r"[^A-Za-z/]", ending)[-1]
+    letters_unit = unit_in_column(letters) if len(letters) > 1 else ""
+    ending = unit_in_column(ending)
+    matches = [u for u in allowed if u and (u == letters_unit or re.search(rf"(?:^|[^A-Za-z]){u}$", ending))]
+    return max(matches, key=len, default=None)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -152,9 +152,9 @@ class Quantity:
     @functools.cached_property
     def sizes(self) -> dict[str, float]:
         """SI value of each unit that its column names may state, its own unit first. Slopes cannot be in percent."""
-        alike: Mapping[str, float] = next((units for units in DIMENSIONS if self.unit in units), {})
-        share = {PERCENT: 1e-2} if self.percent and self.unit != "deg" else {}
-        return {self.unit: self.factor} | {u: size for u, size in alike.items() if u != self.unit} | share
+        dimension: Mapping[str, float] = next((units for units in DIMENSIONS if self.unit in units), {})
+        percent_size = {PERCENT: 1e-2} if self.percent and self.unit != "deg" else {}
+        return {self.unit: self.factor} | {u: size for u, size in dimension.items() if u != self.unit} | percent_size
 
     @property
     def other_units(self) -> Names:
@@ -288,8 +288,8 @@ class Channel(Quantity):
 
     def of_side(self, side: int) -> Channel:
         """The same channel of one side."""
-        name, label = f"{self.name}_{SIDES[side]}", f"{self.label}, {SIDES[side]}"
-        return replace(self, name=name, label=label, word=name, side=side, in_profiles=False)
+        side_name, side_label = f"{self.name}_{SIDES[side]}", f"{self.label}, {SIDES[side]}"
+        return replace(self, name=side_name, label=side_label, word=side_name, side=side, in_profiles=False)
 
     def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
         """Pickles the channel by its name, so that tables and results can go to other processes."""
@@ -310,8 +310,8 @@ def _winding_temperature(robot: Any, signals: Any) -> Any:
 
 #: Loads on which a condition acts.
 GROUND, SHAFT, VEHICLE = "ground", "shaft", "vehicle"
-#: Parameters of the robot that a quantity may depend on: the current at an imposed speed, the voltage at an imposed
-#: speed or current, the winding temperature after long running at a current, and the same over time.
+#: Parameters of the robot that a quantity may depend on. `CURRENT`: the current at an imposed speed. `VOLTAGE`: the
+#: voltage at an imposed speed or current. `HEAT`: the winding temperature after long running. `WARMING`: over time.
 CURRENT = ("motor.torque_constant",)
 VOLTAGE = ("motor.resistance", *CURRENT)
 HEAT = (*VOLTAGE, "motor.resistance_thermal_winding", "motor.resistance_thermal_housing")
@@ -353,9 +353,9 @@ _VOLTAGE = Channel(
 )  # fmt: skip
 _DERIVED = "mmrjax.derived."
 
-#: All quantities, by where they may stand: words of a row of a table; conditions, set for a run; channels of all
-#: robots and of those that turn; outputs of a run; outputs beyond one operating point (`mmrjax.derived`); outputs of
-#: missions and of those with separate sides; columns of histories and of settled turns; limits of requirements.
+#: All quantities by place of use. Labels are words in a row of a table, conditions are set for a run. Channels belong
+#: to all robots or to those that turn. Outputs belong to a run, to several operating points (`mmrjax.derived`), or to
+#: missions. Histories and settled turns have further columns. Requirements limit the last group.
 TABLE: dict[str, tuple[Quantity, ...]] = {
     "label": (
         Quantity("configuration", "", "name of the robot's configuration"),

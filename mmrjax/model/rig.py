@@ -18,8 +18,8 @@ from mmrjax.model.quantities import GOALS, Names
 
 #: Ways in which histories may begin.
 STARTS = ("rest", "measured", "free")
-#: Imposed quantity: the voltage of supply or battery (times the duty), the speed of the motor shafts, or the current
-#: of each motor, supplied by an amplifier; or the goal of a controller (`Robot.controller`), of output or motor.
+#: Imposed quantity: the voltage of supply or battery (times the duty), the speed of the motor shafts, the current of
+#: each motor from an amplifier, or the goal of a controller (`Robot.controller`).
 IMPOSED = ("voltage", "motor_speed", "motor_current", *GOALS)
 #: Imposed values between the rows of a history: those of the row before, or on a straight line to the next.
 BETWEEN = ("held", "linear")
@@ -135,15 +135,15 @@ class Rig(eqx.Module):
 
     def for_equations(self) -> Rig:
         """Same rig without the fields that only files, priors and reports read."""
-        usual = self.start == STARTS[0] and self.between_rows == BETWEEN[0]
-        if usual and not (self.instruments or self.columns or self.priors or self.surfaces):
+        is_usual = self.start == STARTS[0] and self.between_rows == BETWEEN[0]
+        if is_usual and not (self.instruments or self.columns or self.priors or self.surfaces):
             return self
         rectified = tuple(Instrument(i.channel, signed=False) for i in self.instruments if i.signed is False)
         return replace(
             self, instruments=rectified, columns=(), priors=(), start=STARTS[0], between_rows=BETWEEN[0], surfaces=()
         )
 
-    def before(self, times: Times, at: Scalar | Float[Array, "..."]) -> tuple[Array, Array]:
+    def before(self, times: Times, instants: Scalar | Float[Array, "..."]) -> tuple[Array, Array]:
         """Index of the last of `times` before each instant, and the share of the way to the next one [-].
 
         Both are held before the first and after the last. The imposed quantity acts `delay` later than its column
@@ -151,12 +151,16 @@ class Rig(eqx.Module):
 
         Args:
             times: times since the imposed quantity acts [s], increasing.
-            at: instants of the tables' clock [s], any shape.
+            instants: instants of the tables' clock [s], any shape.
         """
-        instant = at - self.delay
-        k = jnp.clip(jnp.searchsorted(times, instant, side="right") - 1, 0, times.shape[0] - 2)
-        gap = times[k + 1] - times[k]
-        return k, jnp.clip(jnp.where(gap > 0, (instant - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0), 0.0, 1.0)
+        acting_instants = instants - self.delay
+        k = jnp.clip(jnp.searchsorted(times, acting_instants, side="right") - 1, 0, times.shape[0] - 2)
+        interval = times[k + 1] - times[k]
+        return k, jnp.clip(
+            jnp.where(interval > 0, (acting_instants - times[k]) / jnp.where(interval > 0, interval, 1.0), 0.0),
+            0.0,
+            1.0,
+        )
 
     @staticmethod
     def between(values: Array, k: Array, share: Array) -> Array:

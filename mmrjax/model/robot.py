@@ -115,7 +115,8 @@ class Robot(eqx.Module):
 
     def for_equations(self) -> Robot:
         """Same robot without the fields that only files, priors and reports read."""
-        rig, effects = self.rig.for_equations(), tuple(e.for_equations() for e in self.effects)
+        rig = self.rig.for_equations()
+        effects = tuple(e.for_equations() for e in self.effects)
         if rig is self.rig and all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
         return replace(self, rig=rig, effects=effects)
@@ -127,10 +128,10 @@ class Robot(eqx.Module):
 
     def showing_turns(self, columns: Collection[str] | None = None) -> Robot:
         """Same robot with instruments for both sides and yaw. With `columns`, only for columns of the table."""
-        shown_channels = self.rig.channels
-        read = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
-        more = [c.name for c in read if c.name not in shown_channels]
-        return replace(self, rig=replace(self.rig, channels=(*shown_channels, *more)))
+        present = self.rig.channels
+        possible = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
+        added = [c.name for c in possible if c.name not in present]
+        return replace(self, rig=replace(self.rig, channels=(*present, *added)))
 
     @property
     def unlike(self) -> Names:
@@ -203,10 +204,10 @@ class Robot(eqx.Module):
         """Same robot in the configuration with this index. Its load is selected once, here, for all equations."""
         if self.configurations.chosen is not None:
             return self
-        copied_robot = eqx.tree_at(
+        configurations = eqx.tree_at(
             lambda c: c.chosen, self.configurations, self.chassis(configuration), is_leaf=lambda x: x is None
         )
-        return replace(self, configurations=copied_robot)
+        return replace(self, configurations=configurations)
 
     @property
     def radius_pulley(self) -> Scalar:

@@ -102,7 +102,7 @@ class Shaft(eqx.Module):
         elastic = jnp.asarray(self.stiffness) > 0
         return jnp.where(elastic, torque / jnp.where(elastic, self.stiffness, 1.0), 0.0)
 
-    def torque_joint(self, gap: Scalar, closing: Scalar, inertia_motor: Scalar) -> Scalar:
+    def torque_joint(self, gap: Scalar, gap_rate: Scalar, inertia_motor: Scalar) -> Scalar:
         """Torque that the gear flanks or the elastic joint carry [N·m], 0 while flanks do not touch.
 
         k s + d ds/dt over the twist s. With backlash s is the compression beyond half of it, and flanks never pull (a
@@ -112,19 +112,23 @@ class Shaft(eqx.Module):
 
         Args:
             gap: angle of the output's motor side ahead of the load, from the middle [rad].
-            closing: rate of the gap [rad/s].
+            gap_rate: rate of the gap [rad/s].
             inertia_motor: inertia of the motor side at the output [kg·m²].
         """
-        inertia = inertia_motor * self.inertia / (inertia_motor + self.inertia)
+        reduced_inertia = inertia_motor * self.inertia / (inertia_motor + self.inertia)
         elastic = jnp.asarray(self.stiffness) > 0
-        stiffness = jnp.where(elastic, self.stiffness, FLANK_STIFFNESS * inertia)
-        damping = jnp.where(elastic, self.damping, FLANK_DAMPING * inertia) * closing
-        flank_forward = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
-        behind = jnp.minimum(gap + 0.5 * self.backlash, 0.0)
+        stiffness = jnp.where(elastic, self.stiffness, FLANK_STIFFNESS * reduced_inertia)
+        damping = jnp.where(elastic, self.damping, FLANK_DAMPING * reduced_inertia) * gap_rate
+        compression_forward = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
+        compression_backward = jnp.minimum(gap + 0.5 * self.backlash, 0.0)
         # Damping sets in over a tenth of the backlash, so that the torque is continuous at contact.
-        full = 0.1 * self.backlash + 1e-4
-        push = jnp.maximum(stiffness * flank_forward + damping * jnp.minimum(flank_forward / full, 1.0), 0.0)
-        pull = jnp.minimum(stiffness * behind + damping * jnp.minimum(-behind / full, 1.0), 0.0)
+        damping_onset = 0.1 * self.backlash + 1e-4
+        push = jnp.maximum(
+            stiffness * compression_forward + damping * jnp.minimum(compression_forward / damping_onset, 1.0), 0.0
+        )
+        pull = jnp.minimum(
+            stiffness * compression_backward + damping * jnp.minimum(-compression_backward / damping_onset, 1.0), 0.0
+        )
         return jnp.where(jnp.asarray(self.backlash) > 0, push + pull, stiffness * gap + damping)
 
     def torque_weight(self, mass: Scalar, slope: Scalar) -> Scalar:
