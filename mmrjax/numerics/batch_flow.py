@@ -32,8 +32,8 @@ def compute_if_needed(needed: Bool[Array, ""], function: Callable[..., T], argum
     def turn(state: tuple[Array, T]) -> tuple[Array, T]:
         # Tied to the loop's state; otherwise the compiler would move the computation out of the loop.
         _, ordered_arguments = jax.lax.optimization_barrier((state[0], arguments))
-        like = jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), function(*ordered_arguments), otherwise)
-        return jnp.zeros_like(state[0]), like
+        result = jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), function(*ordered_arguments), otherwise)
+        return jnp.zeros_like(state[0]), result
 
     return jax.lax.while_loop(lambda state: state[0], turn, (needed, otherwise))[1]
 
@@ -47,21 +47,21 @@ class _MemberLoop(NamedTuple):
     """A loop of one member, see `loop_until`: functions of its numbers.
 
     Attributes:
-        lanes: members that are at work at once.
+        lanes: number of members that are computed at once.
     """
 
-    begun: Callable[[Any], Any]
-    turn: Callable[[Any, Any], Any]
-    ended: Callable[[Any], Bool[Array, ""]]
-    kept: Callable[[Any], Any]
+    initial_state: Callable[[Any], Any]
+    next_state: Callable[[Any, Any], Any]
+    has_ended: Callable[[Any], Bool[Array, ""]]
+    output: Callable[[Any], Any]
     lanes: int
 
     def alone(self, numbers: Any) -> Any:
         """Returns the end of one member."""
-        final_state = jax.lax.while_loop(
-            lambda s: ~self.ended(s), lambda s: self.turn(numbers, s), self.begun(numbers)
+        end = jax.lax.while_loop(
+            lambda s: ~self.has_ended(s), lambda s: self.next_state(numbers, s), self.initial_state(numbers)
         )
-        return self.kept(final_state)
+        return self.output(end)
 
     def refilled(self, numbers: Any, batched: Any, size: int) -> Any:
         """Returns the end of each of `size` members. A queued member replaces a finished one.
@@ -72,76 +72,93 @@ class _MemberLoop(NamedTuple):
         lanes = min(size, self.lanes)
         axes = jax.tree.map(lambda b: 0 if b else None, batched)
 
-        def chosen(which: Array, one: Any, other: Any) -> Any:
+        def select(mask: Array, one: Any, other: Any) -> Any:
             return jax.tree.map(
-                lambda x, y: jnp.where(jnp.reshape(which, which.shape + (1,) * (x.ndim - 1)), x, y), one, other
+                lambda x, y: jnp.where(jnp.reshape(mask, mask.shape + (1,) * (x.ndim - 1)), x, y), one, other
             )
 
-        def at(index: Array) -> Any:
+        def numbers_of(index: Array) -> Any:
             return jax.tree.map(lambda x, b: x[index] if b else x, numbers, batched)
 
-        begin = jax.vmap(self.begun, in_axes=(axes,))
-        go = jax.vmap(self.turn, in_axes=(axes, 0))
-        is_finished = jax.vmap(self.ended)
+        begin = jax.vmap(self.initial_state, in_axes=(axes,))
+        advance = jax.vmap(self.next_state, in_axes=(axes, 0))
+        is_finished = jax.vmap(self.has_ended)
 
-        begins = begin(numbers)
-        idle = is_finished(begins)
-        order, size_busy = jnp.argsort(idle), size - jnp.sum(idle)
+        start_states = begin(numbers)
+        ended_at_start = is_finished(start_states)
+        order = jnp.argsort(ended_at_start)
+        busy_count = size - jnp.sum(ended_at_start)
 
-        def member_of(place: Array) -> Array:
-            return order[jnp.minimum(place, size - 1)]
+        def member_at(queue_position: Array) -> Array:
+            return order[jnp.minimum(queue_position, size - 1)]
 
-        def busy(carry: tuple) -> Array:
-            return jnp.any(carry[1] < size_busy)
+        def has_work(carry: tuple) -> Array:
+            return jnp.any(carry[1] < busy_count)
 
         def step(carry: tuple) -> tuple:
-            results, place, following, state = carry
-            member = member_of(place)
-            state = chosen(is_finished(state), state, go(at(member), state))
-            free = is_finished(state) & (place < size_busy)
+            results, queue_position, next_position, state = carry
+            member = member_at(queue_position)
+            state = select(is_finished(state), state, advance(numbers_of(member), state))
+            free = is_finished(state) & (queue_position < busy_count)
             results = jax.tree.map(
                 lambda all_, x: all_.at[jnp.where(free, member, size)].set(x, mode="drop"),
                 results,
-                jax.vmap(self.kept)(state),
+                jax.vmap(self.output)(state),
             )
-            place = jnp.where(free, following + jnp.cumsum(free) - 1, place)
-            return results, place, following + jnp.sum(free), chosen(free, begin(at(member_of(place))), state)
+            queue_position = jnp.where(free, next_position + jnp.cumsum(free) - 1, queue_position)
+            return (
+                results,
+                queue_position,
+                next_position + jnp.sum(free),
+                select(free, begin(numbers_of(member_at(queue_position))), state),
+            )
 
-        first = jnp.arange(lanes)
-        carry = jax.vmap(self.kept)(begins), first, jnp.asarray(lanes), begin(at(member_of(first)))
-        return jax.lax.while_loop(busy, step, carry)[0]
+        first_positions = jnp.arange(lanes)
+        carry = (
+            jax.vmap(self.output)(start_states),
+            first_positions,
+            jnp.asarray(lanes),
+            begin(numbers_of(member_at(first_positions))),
+        )
+        return jax.lax.while_loop(has_work, step, carry)[0]
 
 
 def loop_until(
-    begun: Callable[[Any], T],
-    turn: Callable[[Any, T], T],
-    ended: Callable[[T], Bool[Array, ""]],
-    own: Any,
-    kept: Callable[[T], Any] = lambda state: state,
-    most: int | None = None,
+    initial_state: Callable[[Any], T],
+    next_state: Callable[[Any, T], T],
+    has_ended: Callable[[T], Bool[Array, ""]],
+    inputs: Any,
+    output: Callable[[T], Any] = lambda state: state,
+    lane_count: int | None = None,
 ) -> Any:
-    """The first state with `ended`, by repeated `turn` from `begun`, without derivatives.
+    """The first state with `has_ended`, by repeated `next_state` from `initial_state`, without derivatives.
 
     A batch of `jax.lax.while_loop` takes the turns of its longest member for every member. This loop takes their
-    mean, plus those of the last `most` members. Members that have ended at the start take none.
+    mean, plus those of the last `lane_count` members. Members that have ended at the start take none.
 
     Args:
-        begun: state of arrays, from `own`.
-        turn: the next state, from `own` and a state.
-        ended: function of a state, True if the member has ended. The functions close over no traced number.
-        own: data of one member. Its numbers may be batched.
-        kept: the part of the last state to return.
-        most: number of members computed at a time, `LANES` if None.
+        initial_state: state of arrays, from `inputs`.
+        next_state: the next state, from `inputs` and a state.
+        has_ended: function of a state, True if the member has ended. The functions close over no traced number.
+        inputs: data of one member. Its numbers may be batched.
+        output: the part of the last state to return.
+        lane_count: number of members computed at a time, `LANES` if None.
     """
-    numbers, static_parts = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
+    numbers, static_parts = eqx.partition(jax.lax.stop_gradient(inputs), eqx.is_array)
 
-    def of(numbers: Any) -> Any:
+    def with_static_parts(numbers: Any) -> Any:
         return eqx.combine(numbers, static_parts)
 
-    lanes = LANES if most is None else most
-    loop = _MemberLoop(lambda x: begun(of(x)), lambda x, state: turn(of(x), state), ended, kept, lanes)
+    lanes = LANES if lane_count is None else lane_count
+    loop = _MemberLoop(
+        lambda x: initial_state(with_static_parts(x)),
+        lambda x, state: next_state(with_static_parts(x), state),
+        has_ended,
+        output,
+        lanes,
+    )
 
-    def many(numbers: Any, batched: Any, size: int) -> T:
+    def run_members(numbers: Any, batched: Any, size: int) -> T:
         """End states of `size` members. If these are batched again, all members share the same lanes."""
 
         @custom_vmap
@@ -150,20 +167,20 @@ def loop_until(
             return result
 
         @each.def_vmap
-        def flat(outer: int, of_outer: Any, numbers: Any) -> tuple[T, Any]:
-            (of_outer,) = of_outer
+        def run_flat(outer: int, outer_batched: Any, numbers: Any) -> tuple[T, Any]:
+            (outer_batched,) = outer_batched
 
-            def member(x: Array, inner: bool, out: bool) -> Array:
-                if inner and not out:
+            def flatten_axes(x: Array, inner: bool, is_outer: bool) -> Array:
+                if inner and not is_outer:
                     return jnp.concatenate([x] * outer)
-                if out and not inner:
+                if is_outer and not inner:
                     return jnp.repeat(x, size, axis=0)
                 return x.reshape(outer * size, *x.shape[2:]) if inner else x
 
-            member_inputs = jax.tree.map(member, numbers, batched, of_outer)
-            either = jax.tree.map(lambda inner, out: inner or out, batched, of_outer)
+            member_inputs = jax.tree.map(flatten_axes, numbers, batched, outer_batched)
+            any_batched = jax.tree.map(lambda inner, is_outer: inner or is_outer, batched, outer_batched)
             flattened = jax.tree.map(
-                lambda x: x.reshape(outer, size, *x.shape[1:]), many(member_inputs, either, outer * size)
+                lambda x: x.reshape(outer, size, *x.shape[1:]), run_members(member_inputs, any_batched, outer * size)
             )
             return flattened, jax.tree.map(lambda _: True, flattened)
 
@@ -176,7 +193,7 @@ def loop_until(
 
     @alone.def_vmap
     def together(size: int, batched: Any, numbers: Any) -> tuple[T, Any]:
-        results = many(numbers, batched[0], size)
+        results = run_members(numbers, batched[0], size)
         return results, jax.tree.map(lambda _: True, results)
 
     return alone(numbers)

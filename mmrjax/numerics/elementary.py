@@ -4,8 +4,8 @@ JAX halves the derivative of `jnp.clip`, `jnp.minimum` and `jnp.maximum` if both
 derivative of `jnp.abs` is 0 at 0. Many defaults are at a bound.
 
 On a CPU XLA's own `sin`, `cos` and `asin` call the C library for each member of a batch. They took nine tenths of the
-time of a closed form with four of them. Each function here ends with a quotient, even if only by ±1, because XLA
-stores quotients once for the whole batch but computes products and sums again for each use.
+time of a closed form with four of them. Each function here ends with a quotient, even if only by ±1. XLA
+stores quotients once for the whole batch, but computes products and sums again for each use.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ def at_most(x: Scalar, high: Scalar) -> Array:
     return jnp.where(x > high, high, x)
 
 
-def magnitude(x: Scalar, way: Scalar) -> Array:
-    """|x|. At 0 the derivative is that for `x` growing in the direction of `way`, of either sign."""
-    backward = (x < 0) | ((x == 0) & (way < 0))
+def magnitude(x: Scalar, direction: Scalar) -> Array:
+    """|x|. At 0 the derivative is that for `x` growing in the direction of `direction`, of either sign."""
+    backward = (x < 0) | ((x == 0) & (direction < 0))
     return jnp.where(backward, -x, x)
 
 
@@ -72,31 +72,32 @@ def _polynomial(x: Array, coefficients: Sequence[float]) -> Array:
 
 def _half_turns(angle: Array) -> tuple[Array, Array]:
     """1 or -1 for an even or odd nearest number of half turns in `angle`, and the remainder, within ±π/2."""
-    turns = jnp.round(angle * (1 / math.pi))
-    return 1 - 2 * jnp.abs(turns - 2 * jnp.round(turns / 2)), (angle - turns * _PI[0]) - turns * _PI[1]
+    half_turns = jnp.round(angle * (1 / math.pi))
+    return 1 - 2 * jnp.abs(half_turns - 2 * jnp.round(half_turns / 2)), (
+        angle - half_turns * _PI[0]
+    ) - half_turns * _PI[1]
 
 
 @jax.custom_jvp
 @jax.jit
 def sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     """sin of an angle within ±1e5 [rad], accurate to 3e-16."""
-    sign, angle_left = _half_turns(angle)
-    return angle_left * _polynomial(angle_left * angle_left, _SINE) / sign
+    sign, remainder = _half_turns(angle)
+    return remainder * _polynomial(remainder * remainder, _SINE) / sign
 
 
 @jax.custom_jvp
 @jax.jit
 def cosine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     """cos of an angle within ±1e5 [rad], accurate to 3e-16."""
-    sign, angle_left = _half_turns(angle)
-    return _polynomial(angle_left * angle_left, _COSINE) / sign
+    sign, remainder = _half_turns(angle)
+    return _polynomial(remainder * remainder, _COSINE) / sign
 
 
 @jax.custom_jvp
 @jax.jit
 def sine_third(share: Float[Array, "..."]) -> Float[Array, "..."]:
     """sin(asin(x) / 3), a root of 3 y - 4 y³ = x, for x within ±1, accurate to 2e-16, NaN beyond."""
-    share = share
     size = jnp.abs(share)
     small = size < 0.5
     # asin x = π/2 - 2 asin √((1 - x) / 2) if the fraction is not accurate.

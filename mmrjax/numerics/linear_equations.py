@@ -91,8 +91,8 @@ def regularise(factors: Factors) -> tuple[Factors, Bool[Array, ""]]:
     factors were kept. A failed member of a batch then does not affect the others, in forward-mode or reverse-mode
     derivatives.
     """
-    size = sum((jnp.abs(x) for row in factors for x in row if x is not None), jnp.zeros(()))
-    is_regular = jnp.isfinite(size)
+    total = sum((jnp.abs(x) for row in factors for x in row if x is not None), jnp.zeros(()))
+    is_regular = jnp.isfinite(total)
     for k, row in enumerate(factors):
         is_regular &= False if (pivot := row[k]) is None else pivot != 0
     return [
@@ -115,11 +115,11 @@ def inverse(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Arr
     return matrix, determinant
 
 
-def _eliminate(matrix: Array, b: Array, turn: Callable[[Array, Array], Array]) -> Array:
+def _eliminate(matrix: Array, b: Array, eliminate: Callable[[Array, Array], Array]) -> Array:
     """Right side after a turn (k, rows) for each unknown k on the rows of matrix and right side."""
     n = matrix.shape[0]
-    done = jax.lax.fori_loop(0, n, turn, jnp.concatenate([matrix, b.reshape(n, -1)], 1))
-    return done[:, n:].reshape(b.shape)
+    reduced = jax.lax.fori_loop(0, n, eliminate, jnp.concatenate([matrix, b.reshape(n, -1)], 1))
+    return reduced[:, n:].reshape(b.shape)
 
 
 def solve(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
@@ -129,15 +129,15 @@ def solve(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array,
     """
     index = jnp.arange(matrix.shape[0])
 
-    def turn(k: Array, rest: Array) -> Array:
-        pivot = jnp.argmax(jnp.where(index < k, -1.0, jnp.abs(rest[:, k])))
-        pivot_row = (index == pivot) @ rest
+    def eliminate(k: Array, rows: Array) -> Array:
+        pivot = jnp.argmax(jnp.where(index < k, -1.0, jnp.abs(rows[:, k])))
+        pivot_row = (index == pivot) @ rows
         row = pivot_row / pivot_row[k]
-        exchanged = jnp.where((index == pivot)[:, None], rest[k], rest)
+        exchanged = jnp.where((index == pivot)[:, None], rows[k], rows)
         column = jnp.where(index == k, 0.0, exchanged[:, k])
         return jnp.where((index == k)[:, None], row, exchanged - column[:, None] * row)
 
-    return _eliminate(matrix, b, turn)
+    return _eliminate(matrix, b, eliminate)
 
 
 def invert(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -150,9 +150,9 @@ def solve_lower(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[
     n = matrix.shape[0]
     index = jnp.arange(n)
 
-    def turn(k: Array, rest: Array) -> Array:
-        row = rest[k] / jnp.sqrt(rest[k, k])
+    def eliminate(k: Array, rows: Array) -> Array:
+        row = rows[k] / jnp.sqrt(rows[k, k])
         column = jnp.where(index > k, row[:n], 0.0)
-        return jnp.where((index == k)[:, None], row, rest - column[:, None] * row)
+        return jnp.where((index == k)[:, None], row, rows - column[:, None] * row)
 
-    return _eliminate(matrix, b, turn)
+    return _eliminate(matrix, b, eliminate)

@@ -39,20 +39,20 @@ _C = (
 KINK = 1e-2
 
 
-def error_norm(error: Unknowns, own: int, weight: float | np.ndarray = 1.0) -> Scalar:
-    """Root mean square of an error of the robot's `own` unknowns. Memories add to it and never dilute it."""
-    return jnp.sqrt(jnp.sum(weight * error**2) / own)
+def error_norm(error: Unknowns, count: int, weight: float | np.ndarray = 1.0) -> Scalar:
+    """Root mean square of an error of the robot's `count` unknowns. Memories add to it and never dilute it."""
+    return jnp.sqrt(jnp.sum(weight * error**2) / count)
 
 
-def error_norm_of_sides(error: Unknowns, whole: slice, own: int) -> Scalar:
-    """Same as `error_norm` for unknowns of both sides and those of the `whole` robot.
+def error_norm_of_sides(error: Unknowns, of_robot: slice, count: int) -> Scalar:
+    """Same as `error_norm` for unknowns of both sides and those of the `of_robot` robot.
 
-    A pair counts as one unknown, so that with equal sides the steps are those of the `own` unknowns of straight
+    A pair counts as one unknown, so that with equal sides the steps are those of the `count` unknowns of straight
     travel.
     """
     weight = np.full(error.shape[0], 0.5)
-    weight[whole] = 1.0
-    return error_norm(error, own, weight)
+    weight[of_robot] = 1.0
+    return error_norm(error, count, weight)
 
 
 def error_across_kink(error: Unknowns, y0: Unknowns, y1: Unknowns, kink: Array) -> Unknowns:
@@ -90,8 +90,8 @@ def rosenbrock_stages(
     """
 
     def both(y: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        rates_there = rates(y)
-        return rates_there, rates_there
+        values = rates(y)
+        return values, values
 
     (jacobian, jacobian_q), (f, g) = jax.jacfwd(both, has_aux=True)(y0)
     # A vanishing pivot spoils the step, and the error control rejects it; a shorter step makes the diagonal dominate.
@@ -122,21 +122,21 @@ def _loop_over_stages(
     first_q: Array,
 ) -> tuple[Array, Array, Array, Array]:
     """The stages after the first, see `rosenbrock_stages`, in one loop."""
-    reach = np.zeros((5, 6))  # of the second to the sixth stage; the sixth begins at the end of the fifth
+    unknown_weights = np.zeros((5, 6))  # of the second to the sixth stage; the sixth begins at the end of the fifth
     for row, weights in enumerate((*_A, (*_A[-1], 1.0))):
-        reach[row, : len(weights)] = weights
-    turns = np.zeros((5, 6))
+        unknown_weights[row, : len(weights)] = weights
+    rate_weights = np.zeros((5, 6))
     for row, weights in enumerate(_C):
-        turns[row, : len(weights)] = weights
+        rate_weights[row, : len(weights)] = weights
 
-    def solve_next_stage(k: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
-        u, v = found
-        a, c = jnp.asarray(reach)[k], jnp.asarray(turns)[k]
+    def solve_next_stage(k: Array, stages: tuple[Array, Array]) -> tuple[Array, Array]:
+        u, v = stages
+        a, c = jnp.asarray(unknown_weights)[k], jnp.asarray(rate_weights)[k]
         f, g = rates(y0 + a @ u)
-        now = inverted @ (f + (c @ u) / h)
-        return u.at[k + 1].set(now), v.at[k + 1].set(h * _GAMMA * (g + (c @ v) / h + jacobian_q @ now))
+        stage = inverted @ (f + (c @ u) / h)
+        return u.at[k + 1].set(stage), v.at[k + 1].set(h * _GAMMA * (g + (c @ v) / h + jacobian_q @ stage))
 
     stage_arrays = [jnp.zeros((6, *x.shape), x.dtype).at[0].set(x) for x in (first, first_q)]
     u, v = jax.lax.fori_loop(0, 5, solve_next_stage, (stage_arrays[0], stage_arrays[1]))
-    last = jnp.asarray(reach)[4].at[5].set(1.0)
+    last = jnp.asarray(unknown_weights)[4].at[5].set(1.0)
     return y0 + last @ u, q0 + last @ v, u, v
