@@ -60,8 +60,8 @@ def in_double(function: Callable[P, T]) -> Callable[P, T]:
             return function(*args, **named)
         with jax.enable_x64(True):
             double_args: Any = [_in_double_precision(x) for x in args]
-            by_name: Any = {name: _in_double_precision(x) for name, x in named.items()}
-            return on_host(function(*double_args, **by_name))
+            double_named: Any = {name: _in_double_precision(x) for name, x in named.items()}
+            return on_host(function(*double_args, **double_named))
 
     return call
 
@@ -147,11 +147,11 @@ def for_equations(x: T) -> T:
 
 #: Options of XLA for programs over a few hundred points: a quarter less compilation time, equal run time.
 SMALL = {"xla_cpu_use_fusion_emitters": False}
-#: The same with few optimizations, for runs over time: half of that compilation time, equal run time (0.91 s compared
-#: with 1.06 s per evaluation of two searches with the library, four runs of 3072 steps).
+#: The same with few optimizations, for runs over time: half of that compilation time, equal run time (0.91 s and
+#: 1.06 s per evaluation of two searches with the library, n = 4 runs of 3072 steps).
 OVER_TIME = {**SMALL, "xla_backend_optimization_level": 1}
-#: The same with few optimizations, for programs that run only a few times: level 0 if that is safe, as on the command
-#: line (the loop on `measured` without stored programs then takes 63 s of processor time, 78 s at level 1).
+#: The same with few optimizations, for programs that run only a few times. Level 0 if that is safe, as on the command
+#: line: the loop on `measured` without stored programs takes 63 s of processor time, and 78 s at level 1.
 SELDOM = {**SMALL, "xla_backend_optimization_level": 0 if SOUND_AT_LEVEL_0 in os.environ.get("XLA_FLAGS", "") else 1}
 
 
@@ -164,7 +164,9 @@ def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None)
     Args:
         options: options of XLA for programs that are stored: `SMALL`, `SELDOM` or None for the defaults.
     """
-    inner, programs, traced = eqx.filter_jit(function), Programs(function, options), set[Hashable]()
+    jitted = eqx.filter_jit(function)
+    programs = Programs(function, options)
+    traced = set[Hashable]()
 
     @functools.wraps(function)
     def call(*args: P.args, **named: P.kwargs) -> T:
@@ -174,9 +176,9 @@ def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None)
         if program is not None:
             return program(arguments)
         if structure is not None and structure in traced:
-            return inner(*arguments[0], **arguments[1])
+            return jitted(*arguments[0], **arguments[1])
         with TRACING:
-            result = inner(*arguments[0], **arguments[1])
+            result = jitted(*arguments[0], **arguments[1])
         if structure is not None:
             traced.add(structure)
         return result

@@ -65,19 +65,19 @@ def exposure_reason(folder: Path) -> str:
     return ""
 
 
-def _folder_exposure_reason(part: Path, itself: bool) -> str:
+def _folder_exposure_reason(part: Path, is_folder: bool) -> str:
     """Reason why another user could replace a folder above, or place files in the folder itself."""
-    state = part.stat(follow_symlinks=itself)
-    if state.st_uid != os.geteuid() and (itself or state.st_uid != 0):
+    state = part.stat(follow_symlinks=is_folder)
+    if state.st_uid != os.geteuid() and (is_folder or state.st_uid != 0):
         return f"{part} belongs to another user"
-    writable = state.st_mode & stat.S_IWOTH or (state.st_mode & stat.S_IWGRP and not _own_group(state.st_gid))
-    sticky = state.st_mode & stat.S_ISVTX and not itself
+    writable = state.st_mode & stat.S_IWOTH or (state.st_mode & stat.S_IWGRP and not _is_private_group(state.st_gid))
+    sticky = state.st_mode & stat.S_ISVTX and not is_folder
     if writable and not sticky and not stat.S_ISLNK(state.st_mode):
         return f"others may write to {part}"
     return ""
 
 
-def _own_group(group: int) -> bool:
+def _is_private_group(group: int) -> bool:
     """True if a group has the user's name: many systems create one for each user."""
     import grp
     import pwd
@@ -97,8 +97,15 @@ _KNOWN = {*OWN, "jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "
 _KNOWN |= {"builtins", "functools", "operator", "math", "collections", "copyreg", "types"}
 #: Settings of JAX and environment variables for logging and storage, which do not change results. Precision is also
 #: here, because stored programs are always in double precision.
-_ASIDE = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_logging", "jax_dump", "jax_enable_x64")
-_HEEDED = ("XLA_", "EQX_")
+_IGNORED_SETTINGS = (
+    "jax_compilation_cache",
+    "jax_persistent_cache",
+    "jax_log",
+    "jax_logging",
+    "jax_dump",
+    "jax_enable_x64",
+)
+_HEEDED_VARIABLES = ("XLA_", "EQX_")
 
 
 #: Lock of the thread that traces: two threads that trace one function fill the same stores of JAX and Equinox, which
@@ -169,7 +176,7 @@ class Programs:
     def __init__(self, function: Callable[..., Any], options: dict[str, Any] | None = None) -> None:
         """Stores the function and the options of the compiler."""
         self.function, self.options = function, options or {}
-        self._found: dict[Any, Future[StoredProgram | None]] = {}
+        self._by_structure: dict[Any, Future[StoredProgram | None]] = {}
 
     def of(self, arguments: tuple[tuple, dict[str, Any]]) -> StoredProgram | None:
         """The program for positional and named arguments, None if it may not be stored."""
@@ -182,47 +189,50 @@ class Programs:
         folder = os.environ.get(VARIABLE, "")
         if structure is None or not folder or not _may_store_programs() or not _folder_is_private(folder):
             return None
-        existing = self._found.get(structure)
-        if existing is not None:
-            return existing.result()
+        known_program = self._by_structure.get(structure)
+        if known_program is not None:
+            return known_program.result()
         # The tracing thread may wait for a program of another thread, which must have finished its own tracing.
         with TRACING:
-            is_new = structure not in self._found
-            promise = self._found.setdefault(structure, Future())
+            is_new = structure not in self._by_structure
+            promise = self._by_structure.setdefault(structure, Future())
             if is_new:
                 leaves, tree = jax.tree.flatten(arguments)
-                make = self._kept(structure, functools.partial(self._obtained, Path(folder), leaves, tree))
+                make = self._result_or_error(
+                    structure, functools.partial(self._loaded_or_lowered, Path(folder), leaves, tree)
+                )
         if is_new:
-            promise.set_result(self._kept(structure, make))
+            promise.set_result(self._result_or_error(structure, make))
         return promise.result()
 
-    def _kept(self, structure: Hashable, make: Callable[[], T]) -> T:
+    def _result_or_error(self, structure: Hashable, make: Callable[[], T]) -> T:
         """Result of `make`, stored. After an error it is forgotten, and waiting threads receive the error."""
         try:
             return make()
         except BaseException as error:
-            self._found.pop(structure).set_exception(error)
+            self._by_structure.pop(structure).set_exception(error)
             raise
 
-    def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Callable[[], StoredProgram | None]:
+    def _loaded_or_lowered(self, folder: Path, leaves: list[Any], tree: Any) -> Callable[[], StoredProgram | None]:
         """Returns a function that gives the program: read from the folder, or traced here, compiled and stored."""
         try:
             name = _program_name(self.function, tree.unflatten([_leaf_structure(x) for x in leaves]))
         except (Unnamed, pickle.PicklingError, AttributeError, TypeError, RecursionError):
             return lambda: None
-        program_file, loaded = folder / f"{name}.program", None
+        program_file = folder / f"{name}.program"
+        loaded = None
         with contextlib.suppress(Exception):  # an unreadable entry, for any reason, is made again
             loaded = pickle.loads(program_file.read_bytes())
         arrays = _arrays(leaves)
         if loaded is not None:
-            result, compiled = loaded
-            executable = _load_executable(folder, compiled, len(arrays), result)
+            result, executable_name = loaded
+            executable = _load_executable(folder, executable_name, len(arrays), result)
             if executable is not None:
                 return functools.partial(StoredProgram, executable, result)
-        result, lowered = self._lowered(leaves, tree)
+        result, lowered = self._lower(leaves, tree)
         text = lowered.as_text()
-        compiled = hashlib.sha256(f"{sorted(self.options.items())}{text}".encode()).hexdigest()
-        executable = _load_executable(folder, compiled, len(arrays), result)
+        executable_name = hashlib.sha256(f"{sorted(self.options.items())}{text}".encode()).hexdigest()
+        executable = _load_executable(folder, executable_name, len(arrays), result)
 
         def make() -> StoredProgram:
             """Compiles in parallel with other threads that trace and compile."""
@@ -236,27 +246,27 @@ class Programs:
                     return StoredProgram(program, result)
                 with contextlib.suppress(Exception):  # an unwritable program, for any reason, is not stored
                     serialized = serialize_executable.serialize(program)[0]
-                    _write_atomically(_executable(folder, compiled), zlib.compress(serialized, 1))
+                    _write_atomically(_executable(folder, executable_name), zlib.compress(serialized, 1))
             with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
-                _write_atomically(program_file, pickle.dumps((result, compiled)))
+                _write_atomically(program_file, pickle.dumps((result, executable_name)))
             return StoredProgram(program, result)
 
         return make
 
-    def _lowered(self, leaves: list[Any], tree: Any) -> tuple[Any, Any]:
+    def _lower(self, leaves: list[Any], tree: Any) -> tuple[Any, Any]:
         """Structure of the function's result, and the function lowered for these arguments."""
         returned: list[Any] = []
 
-        def flat(*arrays: Any) -> list[Any]:
+        def flat_function(*arrays: Any) -> list[Any]:
             array_iterator = iter(arrays)
             args, keywords = tree.unflatten([next(array_iterator) if eqx.is_array(x) else x for x in leaves])
             out, shape = jax.tree.flatten(self.function(*args, **keywords))
             returned.append(jax.tree.unflatten(shape, [_ArrayPlaceholder() if eqx.is_array(x) else x for x in out]))
             return _arrays(out)
 
-        flat.__name__ = f"kept_{getattr(self.function, '__name__', 'function')}"
+        flat_function.__name__ = f"kept_{getattr(self.function, '__name__', 'function')}"
         # The text names the program on disk; without unused arguments, programs of different functions could collide.
-        lowered = jax.jit(flat, keep_unused=True).lower(*_arrays(leaves))
+        lowered = jax.jit(flat_function, keep_unused=True).lower(*_arrays(leaves))
         return returned[0], lowered
 
 
@@ -314,8 +324,8 @@ class _ArgumentPickler(pickle.Pickler):
         self.fast = True  # no references to earlier objects: they depend on which of two equal objects was used
 
     def reducer_override(self, thing: Any) -> Any:
-        by_name = isinstance(thing, type | types.FunctionType | types.BuiltinFunctionType)
-        if by_name and (thing.__module__ or "").partition(".")[0] not in _KNOWN:
+        is_named = isinstance(thing, type | types.FunctionType | types.BuiltinFunctionType)
+        if is_named and (thing.__module__ or "").partition(".")[0] not in _KNOWN:
             raise Unnamed
         if isinstance(thing, type) and _class_object(thing) is not thing:  # made by a function, such as the curves
             facts = sorted((k, v) for k, v in vars(thing).items() if isinstance(v, str | int | float | tuple))
@@ -344,8 +354,8 @@ def _program_name(function: Callable[..., Any], arguments: Any) -> str:
     if qualified_name[0].partition(".")[0] not in OWN or "<" in qualified_name[1]:
         raise Unnamed
     file = io.BytesIO()
-    settings = {k: str(v) for k, v in jax.config.values.items() if not k.startswith(_ASIDE)}
-    settings |= {k: v for k, v in os.environ.items() if k.startswith(_HEEDED)}
+    settings = {k: str(v) for k, v in jax.config.values.items() if not k.startswith(_IGNORED_SETTINGS)}
+    settings |= {k: v for k, v in os.environ.items() if k.startswith(_HEEDED_VARIABLES)}
     _ArgumentPickler(file).dump((qualified_name, tuple(sorted(settings.items())), arguments))
     return hashlib.sha256(source_hash().encode() + file.getvalue()).hexdigest()
 
@@ -390,7 +400,8 @@ def _load_lapack() -> None:
 @contextlib.contextmanager
 def _read_from_cache() -> Iterator[list[str]]:
     """Yields a list that is filled if JAX reads a program from its own cache in this thread meanwhile."""
-    thread_id, read = threading.get_ident(), list[str]()
+    thread_id = threading.get_ident()
+    read = list[str]()
 
     def listen(event: str, **_: Any) -> None:
         if event.endswith("/cache_hits") and threading.get_ident() == thread_id:

@@ -103,8 +103,8 @@ def with_cells(robot: Robot, cells: Scalar) -> Robot:
 
 def _robot_and_conditions_at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Conditions]:
     """The robot with its winding at ambient temperature, as at the start of a run, and the conditions of a point."""
-    warm = robot.motor.resistance * robot.motor.resistance_ratio(point.ambient)
-    motor = replace(robot.motor, resistance=warm)
+    resistance = robot.motor.resistance * robot.motor.resistance_ratio(point.ambient)
+    motor = replace(robot.motor, resistance=resistance)
     robot = with_cells(replace(robot, motor=motor), rated.cells)
     # slightly less charge is taken at a state of charge of 0, because a battery counts as empty there
     discharge = robot.battery.capacity * (1 - jnp.maximum(point.charge, 1e-9))
@@ -137,25 +137,25 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     Further entries are the `current` of one motor and of the `battery` [A] and three margins: `left` of traction and
     speed, `adhesion` alone [-], and `cell`, above the cut-off voltage [V].
     """
-    robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
-    signals, status, _ = operating_state(robot_there, conditions)
+    robot_at_point, conditions = _robot_and_conditions_at(robot, point, rated)
+    signals, status, _ = operating_state(robot_at_point, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_voltage_margin(rated, signals, point) < 0), CUT_OFF, status)
-    warm = replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
-    moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
-    turns = jnp.abs(signals.speed_motor)
+    motor_at_ambient = replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
+    speed_nonzero = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
+    motor_speed = jnp.abs(signals.speed_motor)
     quantities = {
         "speed_m_s": signals.speed,
         "speed_end_of_charge_m_s": signals.speed,
-        "winding_C": warm.temperature_settled(signals.current),
+        "winding_C": motor_at_ambient.temperature_settled(signals.current),
         "gearbox_Nm": jnp.abs(signals.torque_gear),
-        "gearbox_speed_rpm": turns,
-        "motor_speed_rpm": turns,
+        "gearbox_speed_rpm": motor_speed,
+        "motor_speed_rpm": motor_speed,
         "current_A": signals.total_current,
-        "energy_per_metre_Wh": energy.source_power(robot_there, conditions, signals) / moving,
+        "energy_per_metre_Wh": energy.source_power(robot_at_point, conditions, signals) / speed_nonzero,
         "current": signals.current,
-        "battery": robot_there.battery.current(signals.total_current),
+        "battery": robot_at_point.battery.current(signals.total_current),
         "adhesion": 1 - signals.demand / signals.adhesion_limit,
-        "left": steepest_slope.travel_margin(robot_there, signals),
+        "left": steepest_slope.travel_margin(robot_at_point, signals),
         "cell": _cell_voltage_margin(rated, signals, point),
     }
     return {name: jnp.asarray(x) for name, x in quantities.items()}, outcome
@@ -167,10 +167,10 @@ def _travel_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
 
 
 def _steepest_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
-    robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
-    answer = steepest_slope.compute(robot_there, conditions)
-    is_reachable = jnp.isfinite(answer["steepest_slope"])
-    return jnp.where(is_reachable, answer["steepest_slope"], 0.0), answer["status"]
+    robot_at_point, conditions = _robot_and_conditions_at(robot, point, rated)
+    limit = steepest_slope.compute(robot_at_point, conditions)
+    is_finite = jnp.isfinite(limit["steepest_slope"])
+    return jnp.where(is_finite, limit["steepest_slope"], 0.0), limit["status"]
 
 
 #: Halvings of a bracket; a Newton step removes the remaining error.
@@ -183,27 +183,27 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
     The robot travels, its winding settles below its largest temperature, the gearboxes stay within their torque limit
     (if stated), and the cells above their cut-off voltage.
     """
-    most = CONDITIONS["payload"].range[1]
+    heaviest = CONDITIONS["payload"].range[1]
 
     def smallest_margin(robot: Robot, payload: Scalar) -> Scalar:
         loaded_point = replace(point, payload=payload)
-        robot_there, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
-        signals, _, _ = operating_state(robot_there, conditions)
-        heat_margin = thermal_margin(robot, loaded_point, signals.current, rated.temperature)
-        torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
+        robot_at_point, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
+        signals, _, _ = operating_state(robot_at_point, conditions)
+        thermal = thermal_margin(robot, loaded_point, signals.current, rated.temperature)
+        torque_margin = 1 - jnp.abs(signals.torque_gear) / rated.torque
         margins = [
-            steepest_slope.travel_margin(robot_there, signals),
-            heat_margin,
-            torque,
+            steepest_slope.travel_margin(robot_at_point, signals),
+            thermal,
+            torque_margin,
             _cell_voltage_margin(rated, signals, point),
         ]
         return functools.reduce(jnp.minimum, margins)
 
-    found, is_positive = _find_sign_change(smallest_margin, robot, jnp.zeros(()), jnp.asarray(most))
+    payload, travels_empty = _find_sign_change(smallest_margin, robot, jnp.zeros(()), jnp.asarray(heaviest))
     unladen_robot, conditions = _robot_and_conditions_at(robot, replace(point, payload=jnp.zeros(())), rated)
     signals, status, _ = operating_state(unladen_robot, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_voltage_margin(rated, signals, point) < 0), CUT_OFF, status)
-    return jnp.where(is_positive, found, 0.0), outcome
+    return jnp.where(travels_empty, payload, 0.0), outcome
 
 
 def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
@@ -219,16 +219,20 @@ def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Ar
         is_positive = margin(constant_robot, middle) > 0
         return (jnp.where(is_positive, middle, a), jnp.where(is_positive, b, middle)), None
 
-    begin, end = jax.lax.stop_gradient((low, high))
-    (a, b), _ = jax.lax.scan(halve, (begin, end), None, length=HALVINGS)
-    root = (a + b) / 2
-    steep = value_and_slope(lambda x: margin(constant_robot, x), root)[1]
-    usable = jnp.isfinite(steep) & (jnp.abs(steep) > 1e-12)
-    step = margin(robot, root) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
-    edge = root - jnp.where(usable & jnp.isfinite(step), step, 0.0)
+    constant_low, constant_high = jax.lax.stop_gradient((low, high))
+    (a, b), _ = jax.lax.scan(halve, (constant_low, constant_high), None, length=HALVINGS)
+    middle_left = (a + b) / 2
+    slope = value_and_slope(lambda x: margin(constant_robot, x), middle_left)[1]
+    usable = jnp.isfinite(slope) & (jnp.abs(slope) > 1e-12)
+    step = margin(robot, middle_left) / jnp.where(usable, jax.lax.stop_gradient(slope), 1.0)
+    crossing = middle_left - jnp.where(usable & jnp.isfinite(step), step, 0.0)
     # A margin that jumps has no root for a Newton step.
-    edge = jnp.where(jnp.abs(edge - root) < 1e-3 * (end - begin) + 1e-9, edge, root)
-    return jnp.where(margin(constant_robot, end) > 0, high, edge), margin(constant_robot, begin) > 0
+    crossing = jnp.where(
+        jnp.abs(crossing - middle_left) < 1e-3 * (constant_high - constant_low) + 1e-9, crossing, middle_left
+    )
+    return jnp.where(margin(constant_robot, constant_high) > 0, high, crossing), margin(
+        constant_robot, constant_low
+    ) > 0
 
 
 #: Nodes of the integral over the charge.
@@ -241,29 +245,31 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
     The robot drives at full voltage for a share s of the time and stands otherwise. It ends when a cell reaches its
     cut-off.
     """
-    charge_at_begin, charge_at_end = (
+    discharge_begin, discharge_end = (
         jnp.asarray(robot.battery.capacity * (1 - x)) for x in (point.charge, point.charge_end)
     )
 
-    def drawn(robot: Robot, discharge: Scalar) -> tuple[Scalar, Scalar, Array]:
+    def load_at(robot: Robot, discharge: Scalar) -> tuple[Scalar, Scalar, Array]:
         """Mean battery current [A], margin above the cut-off [V], status."""
-        robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
+        robot_at_point, conditions = _robot_and_conditions_at(robot, point, rated)
         conditions = replace(conditions, discharge=jnp.asarray(discharge))
-        signals, status, _ = operating_state(robot_there, conditions)
-        stands = point.share <= 0
-        motors = jnp.where(stands, 0.0, signals.total_current)
-        cell = robot_there.battery.voltage(motors, discharge) / rated.cells - rated.voltage_cutoff
-        current = robot_there.battery.current(point.share * motors)
-        return current, cell, jnp.where(stands, CONVERGED, status)
+        signals, status, _ = operating_state(robot_at_point, conditions)
+        is_standing = point.share <= 0
+        motor_current = jnp.where(is_standing, 0.0, signals.total_current)
+        cell_margin = robot_at_point.battery.voltage(motor_current, discharge) / rated.cells - rated.voltage_cutoff
+        current = robot_at_point.battery.current(point.share * motor_current)
+        return current, cell_margin, jnp.where(is_standing, CONVERGED, status)
 
-    end, begins = _find_sign_change(lambda robot, c: drawn(robot, c)[1], robot, charge_at_begin, charge_at_end)
+    discharge_last, can_begin = _find_sign_change(
+        lambda robot, c: load_at(robot, c)[1], robot, discharge_begin, discharge_end
+    )
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    discharges = charge_at_begin + (end - charge_at_begin) * jnp.asarray((nodes + 1) / 2)
-    current, _, status = jax.vmap(lambda c: drawn(robot, c))(discharges)
-    flowing = jnp.maximum(current, 1e-9)
-    time = (end - charge_at_begin) * jnp.sum(jnp.asarray(weights / 2) / flowing)
-    worst = status[jnp.argmax(status != CONVERGED)]
-    outcome = jnp.where(begins, worst, CUT_OFF)
+    discharges = discharge_begin + (discharge_last - discharge_begin) * jnp.asarray((nodes + 1) / 2)
+    current, _, status = jax.vmap(lambda c: load_at(robot, c))(discharges)
+    current_nonzero = jnp.maximum(current, 1e-9)
+    time = (discharge_last - discharge_begin) * jnp.sum(jnp.asarray(weights / 2) / current_nonzero)
+    first_failure = status[jnp.argmax(status != CONVERGED)]
+    outcome = jnp.where(can_begin, first_failure, CUT_OFF)
     return time, outcome
 
 
@@ -278,22 +284,22 @@ DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
 
 def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     """A settled turn on level ground at full voltage: on the spot with opposite sides, or around a braked side."""
-    robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
+    robot_at_point, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = replace(
         conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
         duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
     )  # fmt: skip
-    signals, motion, status = circling_signals(robot_there, conditions)
-    low = jnp.any(jnp.asarray(_cell_voltage_margin(rated, signals.signals, point)) < 0)
-    turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
+    travel, motion, status = circling_signals(robot_at_point, conditions)
+    cell_low = jnp.any(jnp.asarray(_cell_voltage_margin(rated, travel.signals, point)) < 0)
+    yaw_rate_nonzero = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
     speed_squared = motion.speed**2 + motion.speed_lateral**2
     # A root of 0 has no derivative.
     value = (
         motion.yaw_rate
         if name == "turn_in_place_rad_s"
-        else jnp.sqrt(jnp.maximum(speed_squared, 1e-24)) / jnp.abs(turns)
+        else jnp.sqrt(jnp.maximum(speed_squared, 1e-24)) / jnp.abs(yaw_rate_nonzero)
     )
-    return jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status)
+    return jnp.asarray(value), jnp.where((status == CONVERGED) & cell_low, CUT_OFF, status)
 
 
 def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
@@ -302,10 +308,10 @@ def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -
     Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
     tan α = B / (2 h). For a rigid robot whose load does not shift.
     """
-    robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
+    robot_at_point, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
-    chassis = robot_there.chassis(conditions.configuration)
-    stance = balances.stance(robot_there, conditions, chassis, chassis.mass + point.payload)
+    chassis = robot_at_point.chassis(conditions.configuration)
+    stance = balances.stance(robot_at_point, conditions, chassis, chassis.mass + point.payload)
     friction = chassis.ground.friction.static * point.adhesion
     rolling_share = jnp.minimum(chassis.ground.rolling_resistance / friction, 1.0)
     # A root of 0 has no derivative.
@@ -332,7 +338,7 @@ def _posture_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: 
     return jnp.asarray(value), jnp.asarray(CONVERGED)
 
 
-#: Function of each group of quantities: (robot, point, ratings, name) -> Found.
+#: Function of each group of quantities: (robot, point, ratings, name) -> Valued.
 GROUPS = {"travel": _travel_quantity, "slope": _steepest_slope, "payload": _largest_payload, "endurance": _endurance,
 "mass": _mass_quantity,
           "turn": _settled_turn, "across": _side_slope, "posture": _posture_quantity}  # fmt: skip

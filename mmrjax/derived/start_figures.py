@@ -41,6 +41,7 @@ class StartStages:
         settled: t' [s]: the speed is within 1 % of its last value, the mean over the last 0.15 s.
         end: end of the run [s].
         slip: mean slip of each stage [-] (`mean_slip`), NaN for a stage without length.
+        slip_settling: mean slip until t' [-].
     """
 
     sense: float
@@ -49,7 +50,7 @@ class StartStages:
     settled: float
     end: float
     slip: tuple[float, float, float]
-    over_settling: float
+    slip_settling: float
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -66,7 +67,7 @@ class StartStages:
         return {
             "stages": [{"stage": n, "from_s": a, "until_s": b, "slip": number(s)} for n, a, b, s in stages],
             "acceleration_time_s": self.settled,
-            "slip_over_acceleration": number(self.over_settling),
+            "slip_over_acceleration": number(self.slip_settling),
         }
 
 
@@ -105,7 +106,7 @@ def stages_of_start(
     theoretical: OverTime,
     sliding: OverTime,
     speed_static: float,
-    way: float = 0.0,
+    ripple_pitch: float = 0.0,
 ) -> StartStages:
     """Stages of one start, from samples without gaps.
 
@@ -114,16 +115,18 @@ def stages_of_start(
         speed, theoretical, sliding: speed V, theoretical speed r_k ω_k, and speed of the contact patch over the
             ground [m/s].
         speed_static: V_s of the friction law [m/s].
-        way: travel between two contacts that cause ripple [m], 0 for none. Speeds are averaged over that distance at
-            the last speed.
+        ripple_pitch: travel between two contacts that cause ripple [m], 0 for none. Speeds are averaged over that
+            distance at the last speed.
     """
     sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
     starting = float(time[int(np.argmax(sense * sliding))])
-    sliding, even = (_moving_means(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
+    sliding, mean_speed = (
+        _moving_means(time, x, ripple_pitch / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed)
+    )
     slipping_instants = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
     slipping = float(time[min(int(slipping_instants[-1]) + 1, len(time) - 1)]) if slipping_instants.size else starting
     final_speed = speed[last_samples(time)].mean()
-    unsettled_instants = np.flatnonzero(np.abs(even - final_speed) > WITHIN * abs(final_speed))
+    unsettled_instants = np.flatnonzero(np.abs(mean_speed - final_speed) > WITHIN * abs(final_speed))
     settled = float(time[min(int(unsettled_instants[-1]) + 1, len(time) - 1)]) if unsettled_instants.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
     slips = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
@@ -132,24 +135,29 @@ def stages_of_start(
 
 
 def stages_of_histories(
-    robot: Robot, history: History, which: Sequence[int] | np.ndarray
+    robot: Robot, history: History, configurations: Sequence[int] | np.ndarray
 ) -> list[StartStages | None]:
     """Stages of each run of a batch from standstill, up to its last finite sample. None for a run without samples.
 
     Args:
-        which: index of each run's configuration in `robot`. Its loads are vehicles.
+        configurations: index of each run's configuration in `robot`. Its loads are vehicles.
     """
     stages: list[StartStages | None] = []
-    for k, index in enumerate(which):
+    for k, index in enumerate(configurations):
         signals = history.signals
-        upto = count_finite_samples(np.asarray(signals.total_current)[k])
-        of_run = (history.time, signals.speed, signals.speed_theoretical, signals.speed_sliding)
-        time, *motion = (np.asarray(x)[k][:upto] for x in of_run)
+        sample_count = count_finite_samples(np.asarray(signals.total_current)[k])
+        series = (history.time, signals.speed, signals.speed_theoretical, signals.speed_sliding)
+        time, *motion = (np.asarray(x)[k][:sample_count] for x in series)
         chassis = robot.configurations.members[int(index)]
-        static, way = float(chassis.ground.friction.speed_static), 0.0
+        speed_static = float(chassis.ground.friction.speed_static)
+        ripple_pitch = 0.0
         if history.reactions is not None:  # from individual contacts
-            way = PITCH_GROUSER if float(chassis.on_tracks) > 0.5 else PITCH_TOOTH
-        stages.append(stages_of_start(time, motion[0], motion[1], motion[2], static, way) if upto else None)
+            ripple_pitch = PITCH_GROUSER if float(chassis.on_tracks) > 0.5 else PITCH_TOOTH
+        stages.append(
+            stages_of_start(time, motion[0], motion[1], motion[2], speed_static, ripple_pitch)
+            if sample_count
+            else None
+        )
     return stages
 
 
@@ -184,15 +192,15 @@ def curve_peak(times: Times, x: Times, kink: Scalar = np.inf) -> Float[Array, ""
     """
     finite_values = jnp.where(jnp.isfinite(x), x, -jnp.inf)
     k = jnp.clip(jnp.argmax(finite_values), 1, x.shape[0] - 2)
-    before, after = times[k] - times[k - 1], times[k + 1] - times[k]
-    is_peak = (before > 0) & (after > 0) & (x[k] > x[k - 1]) & (x[k] > x[k + 1])
-    before, after = jnp.where(is_peak, before, 1.0), jnp.where(is_peak, after, 1.0)
-    rise, fall = (x[k] - x[k - 1]) / before, (x[k + 1] - x[k]) / after
-    bend = (fall - rise) / (before + after)
-    slope = rise + bend * before
+    width_before, width_after = times[k] - times[k - 1], times[k + 1] - times[k]
+    is_peak = (width_before > 0) & (width_after > 0) & (x[k] > x[k - 1]) & (x[k] > x[k + 1])
+    width_before, width_after = jnp.where(is_peak, width_before, 1.0), jnp.where(is_peak, width_after, 1.0)
+    rise, fall = (x[k] - x[k - 1]) / width_before, (x[k + 1] - x[k]) / width_after
+    curvature = (fall - rise) / (width_before + width_after)
+    slope = rise + curvature * width_before
     highest = finite_values[jnp.argmax(finite_values)]
-    top = jnp.minimum(x[k] - slope**2 / (4 * jnp.where(is_peak, bend, -1.0)), jnp.maximum(kink, highest))
-    return jnp.where(is_peak, top, highest)
+    vertex = jnp.minimum(x[k] - slope**2 / (4 * jnp.where(is_peak, curvature, -1.0)), jnp.maximum(kink, highest))
+    return jnp.where(is_peak, vertex, highest)
 
 
 def first_crossing(times: Times, x: Times, rate: Times, level: Array) -> tuple[Array, Array]:
@@ -203,15 +211,15 @@ def first_crossing(times: Times, x: Times, rate: Times, level: Array) -> tuple[A
     """
     k = jnp.clip(jnp.argmax(x >= level), 1, x.shape[0] - 1) - 1
     width, rise = times[k + 1] - times[k], x[k + 1] - x[k]
-    begin, end = width * rate[k], width * rate[k + 1]
+    slope_begin, slope_end = width * rate[k], width * rate[k + 1]
 
     def cubic(s: Array) -> Array:
-        return x[k] + s * rise + s * (1 - s) * ((1 - s) * (begin - rise) - s * (end - rise))
+        return x[k] + s * rise + s * (1 - s) * ((1 - s) * (slope_begin - rise) - s * (slope_end - rise))
 
     share = (level - x[k]) / jnp.where(rise > 0, rise, 1.0)
     for _ in range(3):
-        steep = value_and_slope(cubic, share)[1]
-        share = share - (cubic(share) - level) / jnp.where(jnp.abs(steep) > 0, steep, 1.0)
+        slope = value_and_slope(cubic, share)[1]
+        share = share - (cubic(share) - level) / jnp.where(jnp.abs(slope) > 0, slope, 1.0)
     return k, jnp.clip(share, 0.0, 1.0)
 
 
@@ -228,16 +236,17 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     times = jnp.asarray(np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)]))
     run = drive(robot, conditions, times, TOLERANCE)
     signals = run.signals
-    speed, rate, current = (x for x in (signals.speed, signals.acceleration, signals.total_current))
+    speed = signals.speed
+    current = signals.total_current
     power = signals.voltage * current
-    k, share = first_crossing(times, speed, rate, SHARE * speed[-1])
+    before, fraction = first_crossing(times, speed, signals.acceleration, SHARE * speed[-1])
     width = jnp.diff(times)
     energy_so_far = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
-    power_at_instant = power[k] + share * (power[k + 1] - power[k])
+    power_at_instant = power[before] + fraction * (power[before + 1] - power[before])
     columns = {
         "peak_current": curve_peak(times, (robot.sides * signals.current), robot.sides * robot.driver.current_limit),
-        "time_to_speed": times[k] + share * width[k],
-        "energy_start": energy_so_far[k] + share * width[k] * (power[k] + power_at_instant) / 2,
+        "time_to_speed": times[before] + fraction * width[before],
+        "energy_start": energy_so_far[before] + fraction * width[before] * (power[before] + power_at_instant) / 2,
     }
     converged = run.result.status == CONVERGED
     return {**{name: jnp.where(converged, x, jnp.nan) for name, x in columns.items()}, "status": run.result.status}

@@ -35,9 +35,9 @@ def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
 
     Positive if `steady` would converge. Both are continuous beyond their limit.
     """
-    rest = robot.chassis(signals.configuration).speed_still
-    slowest = jnp.minimum(signals.speed_theoretical, signals.speed)
-    return jnp.minimum(1.0 - signals.demand / signals.adhesion_limit, slowest / rest - 1.0)
+    speed_rest = robot.chassis(signals.configuration).speed_still
+    speed_least = jnp.minimum(signals.speed_theoretical, signals.speed)
+    return jnp.minimum(1.0 - signals.demand / signals.adhesion_limit, speed_least / speed_rest - 1.0)
 
 
 @compiled
@@ -52,10 +52,10 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         if it climbs that. `status` is that of level ground.
     """
     level_point = operating_point(robot, replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)))[0]
-    still_robot, still = jax.lax.stop_gradient((robot, conditions))
+    constant_robot, constant_conditions = jax.lax.stop_gradient((robot, conditions))
 
     solution: optx.Solution = optx.root_find(
-        lambda slope, _: slope_margin(still_robot, still, slope),
+        lambda derivative, _: slope_margin(constant_robot, constant_conditions, derivative),
         optx.Bisection(rtol=0.0, atol=0.0, flip=True),  # type: ignore[call-arg]  # its norm is no field
         jnp.full_like(conditions.slope_deg, STEEPEST / 2),
         options={"lower": 0.0, "upper": STEEPEST},
@@ -63,9 +63,11 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         throw=False,
     )
     root = jax.lax.stop_gradient(solution.value)
-    slope = jax.lax.stop_gradient(value_and_slope(lambda a: slope_margin(still_robot, still, a), root)[1])
-    steepest = root - slope_margin(robot, conditions, root) / slope
-    holds_all = slope_margin(still_robot, still, jnp.full_like(root, STEEPEST)) > 0
+    derivative = jax.lax.stop_gradient(
+        value_and_slope(lambda a: slope_margin(constant_robot, constant_conditions, a), root)[1]
+    )
+    steepest = root - slope_margin(robot, conditions, root) / derivative
+    holds_all = slope_margin(constant_robot, constant_conditions, jnp.full_like(root, STEEPEST)) > 0
     steepest = jnp.where(holds_all, STEEPEST, jnp.clip(steepest, 0.0, STEEPEST))
     return {
         "steepest_slope": jnp.where(level_point.status == CONVERGED, steepest, jnp.nan),

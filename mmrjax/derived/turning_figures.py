@@ -29,10 +29,10 @@ def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
         ahead, aside: speeds of the centre of mass [m/s].
         rate: yaw rate [rad/s]. All arguments have the same shape.
     """
-    turns = jnp.abs(rate) > NONE
-    along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of 0 has no derivative
+    is_turning = jnp.abs(rate) > NONE
+    path_speed = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of 0 has no derivative
     turn_sign = jnp.where(jnp.asarray(ahead) * rate < 0, -1.0, 1.0)
-    return jnp.where(turns, turn_sign * along / jnp.where(turns, jnp.abs(rate), 1.0), jnp.inf)
+    return jnp.where(is_turning, turn_sign * path_speed / jnp.where(is_turning, jnp.abs(rate), 1.0), jnp.inf)
 
 
 @compiled
@@ -53,23 +53,24 @@ def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray
     Args:
         radius: radius of the driving wheels [m].
     """
-    turn = np.asarray(reading["yaw_rate"])
+    yaw_rate = np.asarray(reading["yaw_rate"])
     # A value within rounding of zero is no radius.
-    rate = np.where(np.abs(turn) > NONE, turn, np.nan)
-    shafts = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in channels.SIDES}
-    rolled = {side: radius * n / float(robot.gearbox.ratio) for side, n in shafts.items()}
-    units = float(robot.sides) / 2
-    ahead, left = (-np.asarray(reading["lateral_speed"]) / rate, np.asarray(reading["speed"]) / rate)
+    yaw_rate_nonzero = np.where(np.abs(yaw_rate) > NONE, yaw_rate, np.nan)
+    shaft_speeds = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in channels.SIDES}
+    theoretical_speeds = {side: radius * n / float(robot.gearbox.ratio) for side, n in shaft_speeds.items()}
+    motors_per_side = float(robot.sides) / 2
+    centre_x = -np.asarray(reading["lateral_speed"]) / yaw_rate_nonzero
+    centre_y = np.asarray(reading["speed"]) / yaw_rate_nonzero
     columns = {
         "turning_radius_mm": np.asarray(turning_radius(*(np.asarray(reading[name]) for name in PLANE))) / MM,
-        "centre_x_mm": ahead / MM,
-        "centre_y_mm": left / MM,
-        "effective_width_mm": (rolled["right"] - rolled["left"]) / rate / MM,
+        "centre_x_mm": centre_x / MM,
+        "centre_y_mm": centre_y / MM,
+        "effective_width_mm": (theoretical_speeds["right"] - theoretical_speeds["left"]) / yaw_rate_nonzero / MM,
     }
     for side in channels.SIDES:
         current = np.asarray(reading[f"motor_current_{side}"])
-        columns[f"power_{side}_W"] = units * np.asarray(reading[f"motor_voltage_{side}"]) * current
+        columns[f"power_{side}_W"] = motors_per_side * np.asarray(reading[f"motor_voltage_{side}"]) * current
     for side in channels.SIDES:
         current = np.asarray(reading[f"motor_current_{side}"])
         columns[f"winding_{side}_C"] = np.asarray(robot.motor.temperature_settled(jnp.asarray(current)))
-    return {name: np.where(np.isnan(turn), np.nan, x) for name, x in columns.items()}
+    return {name: np.where(np.isnan(yaw_rate), np.nan, x) for name, x in columns.items()}

@@ -168,8 +168,10 @@ OF_TURNS = ".turning."
 
 def unread_parameters(name: str, parameters: Iterable[str], turns: bool) -> Names:
     """Names of those parameters that a fidelity does not use, in straight travel or in turns."""
-    of_others = {head for other in TABLE.values() for head in other.resolves} - set(fidelity_facts(name).resolves)
-    return tuple(p for p in parameters if p.startswith(tuple(of_others)) or (OF_TURNS in p and not turns))
+    foreign_prefixes = {head for other in TABLE.values() for head in other.resolves} - set(
+        fidelity_facts(name).resolves
+    )
+    return tuple(p for p in parameters if p.startswith(tuple(foreign_prefixes)) or (OF_TURNS in p and not turns))
 
 
 def get_fidelity(name: str) -> Fidelity:

@@ -63,14 +63,15 @@ class History(eqx.Module):
         Signals with a further axis of left and right side are averaged over it.
         """
         if jnp.ndim(signals.current) > jnp.ndim(time):
-            reading, signals = _channel_readings(robot, signals, apart=True), balances.mean_of_sides(signals)
+            reading = _channel_readings(robot, signals, of_sides=True)
+            signals = balances.mean_of_sides(signals)
         else:
             reading = _channel_readings(robot, signals)
         if not robot.knows(VOLTAGE):
             nan = jnp.full_like(signals.current, jnp.nan)
-            volts = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
-            unknown: dict[str, Any] = dict.fromkeys(volts, nan)
-            signals = replace(signals, **unknown)
+            voltage_fields = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
+            masked: dict[str, Any] = dict.fromkeys(voltage_fields, nan)
+            signals = replace(signals, **masked)
         clock, (distance, signals, reading, reactions) = in_table_time(
             robot.rig, time, (distance, signals, reading, reactions)
         )
@@ -91,14 +92,14 @@ def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tu
         return time, values
     values = jax.tree.map(lambda x: jnp.broadcast_to(x, time.shape) if jnp.ndim(x) < 2 else jnp.asarray(x), values)
     clock = rig.clock(time)
-    places = _before(rig, time, clock)
-    return clock, jax.tree.map(lambda x: _between_for_batch(x, *places), values)
+    position = _before(rig, time, clock)
+    return clock, jax.tree.map(lambda x: _between_for_batch(x, *position), values)
 
 
 @compiled
-def _channel_readings(robot: Robot, signals: Signals, apart: bool = False) -> Scalars:
-    """Readings of the channels that change in a history. `apart`: signals have a left and a right side."""
-    readings = balances.readings_of_sides(robot, signals) if apart else balances.sensor(robot, signals)
+def _channel_readings(robot: Robot, signals: Signals, of_sides: bool = False) -> Scalars:
+    """Readings of the channels that change in a history. `of_sides`: signals have a left and a right side."""
+    readings = balances.readings_of_sides(robot, signals) if of_sides else balances.sensor(robot, signals)
     return {c.name: readings[c.name] for c in channels.EVERY if c.over_time}
 
 
@@ -141,13 +142,13 @@ class ImplicitSolution:
     Attributes:
         solve: function that returns the unknowns, shape (unknowns,), and True if they were found. Without
             derivatives.
-        shown: returns result and signals for given unknowns (differentiable in them and in the robot) and the
-            residuals of the equations, shape (unknowns,). A demand above the ground's limit counts as sliding. For a
-            fit it is out of reach in any case.
+        results_at: function that returns result and signals for given unknowns, and the residuals of the equations,
+            shape (unknowns,). Differentiable in unknowns and robot. A demand above the ground's limit counts as
+            sliding. No fit reaches it in any case.
     """
 
     solve: Callable[[Robot, Conditions], tuple[Array, Array]]
-    shown: Callable[[Robot, Conditions, Array, Array], tuple[Result, Signals, Array]]
+    results_at: Callable[[Robot, Conditions, Array, Array], tuple[Result, Signals, Array]]
 
 
 def _accept_every_run(
@@ -172,7 +173,7 @@ class Fidelity:
         run: results of a batch, as in a sweep.
         outputs: function that computes only the named outputs of a batch [SI] and `status`, faster than `run`. None
             if it would not be faster. A fidelity with it has no options.
-        columns: names of further columns of its runs (`Run.columns`).
+        columns: names of further columns of its runs (`RunBatch.columns`).
         histories: a batch from standstill over time, None for a fidelity without time.
         check: function that raises ValueError before the first simulation if some run of a batch cannot be computed.
         cautions: warnings about the steady readings of a calibrated robot, one sentence each.
@@ -233,27 +234,29 @@ def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."])
     return mask_unknown(robot, result)
 
 
-def mask_unknown(robot: Robot, found: Result) -> Result:
-    """Copy of `found` in which numbers that depend on unknown parameters of the robot are NaN."""
+def mask_unknown(robot: Robot, result: Result) -> Result:
+    """Copy of `result` in which numbers that depend on unknown parameters of the robot are NaN."""
     unknown = [output.name for output in outputs.FURTHER if not robot.knows(output.rests_on)]
-    nan: dict[str, Any] = {name: jnp.full_like(getattr(found, name), jnp.nan) for name in unknown}
-    return replace(found, **nan)
+    nan: dict[str, Any] = {name: jnp.full_like(getattr(result, name), jnp.nan) for name in unknown}
+    return replace(result, **nan)
 
 
 def exceeded_limits(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """Limits exceeded at an instant, by the flag's name."""
-    battery, on_battery = robot.battery, signals.battery > 0.5
-    cell, current = signals.voltage_source / battery.cells, battery.current(signals.total_current)
+    battery = robot.battery
+    on_battery = signals.battery > 0.5
+    cell_voltage = signals.voltage_source / battery.cells
+    current = battery.current(signals.total_current)
     discharge_limit, charge_limit = battery.current_limit or jnp.inf, battery.current_charge or jnp.inf
     # A full cell at rest may have its charge voltage: only a current into it can exceed the limit.
-    overcharged = (cell > battery.voltage_charge) & (current < 0)
+    overcharged = (cell_voltage > battery.voltage_charge) & (current < 0)
     torque = jnp.abs(signals.torque_gear)
     return {
         "motor_overspeed": jnp.abs(signals.speed_motor) > robot.motor.speed_limit,
         "gearbox_overspeed": jnp.abs(signals.speed_motor) > robot.gearbox.speed_limit,
         "slips": movers_slip(robot, signals),
         "overvoltage": on_battery & (overcharged | (current < -charge_limit)),
-        "cut_off": on_battery & (cell < battery.voltage_cutoff),
+        "cut_off": on_battery & (cell_voltage < battery.voltage_cutoff),
         "battery_overcurrent": on_battery & (current > discharge_limit),
         "current_limited": robot.driver.limits(signals.current),
         "gearbox_overload": torque > (robot.gearbox.torque_limit or jnp.inf),
@@ -262,9 +265,11 @@ def exceeded_limits(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     }
 
 
-def flag_mask(over: Mapping[str, Scalar]) -> Array:
+def flag_mask(exceeded: Mapping[str, Scalar]) -> Array:
     """Bit mask over `FLAGS`."""
-    return jnp.asarray(sum(jnp.where(o, 1 << FLAGS.index(name), 0) for name, o in over.items()))
+    return jnp.asarray(
+        sum(jnp.where(is_exceeded, 1 << FLAGS.index(name), 0) for name, is_exceeded in exceeded.items())
+    )
 
 
 def travel_status(speed: Scalar, voltage: Scalar) -> Array:
@@ -272,8 +277,8 @@ def travel_status(speed: Scalar, voltage: Scalar) -> Array:
     from motion driven by gravity.
     """
     backward = speed < 0
-    has_asked_sign = jnp.where(backward, voltage < 0, voltage >= 0)
-    return jnp.where(has_asked_sign, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
+    follows_voltage = jnp.where(backward, voltage < 0, voltage >= 0)
+    return jnp.where(follows_voltage, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
 
 
 def movers_slip(robot: Robot, signals: Signals) -> Array:
@@ -288,13 +293,13 @@ def power_ratio(out: Scalar, into: Scalar) -> Array:
     return jnp.where(forward, safe_quotient(out, into), 0.0)
 
 
-def withhold_numbers(answer: Result, valid: Array, sound: Array) -> Result:
-    """Sets every number of `answer` to NaN if `valid` is false. Keeps mass and adhesion used if `sound`.
+def withhold_numbers(result: Result, valid: Array, sound: Array) -> Result:
+    """Sets every number of `result` to NaN if `valid` is false. Keeps mass and adhesion used if `sound`.
 
     The flags of a withheld member are cleared. Its status says why it has no numbers.
     """
     blank = jax.tree.map(
-        lambda x: jnp.where(valid, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), answer
+        lambda x: jnp.where(valid, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), result
     )
-    stands = {name: jnp.where(sound, getattr(answer, name), jnp.nan) for name in ("mass", "adhesion_used")}
-    return replace(blank, **stands, status=answer.status)
+    kept = {name: jnp.where(sound, getattr(result, name), jnp.nan) for name in ("mass", "adhesion_used")}
+    return replace(blank, **kept, status=result.status)

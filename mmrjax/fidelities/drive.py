@@ -82,9 +82,9 @@ def state_of_unknowns(robot: Robot, y: Unknowns) -> State:
     """The state of a vector of unknowns."""
     y = y * jnp.asarray(drive_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
-    first = len(_UNITS) + len(memory)
+    position = len(_UNITS) + len(memory)
     controller_states = dict(
-        zip(robot.controller_states, y[first : first + len(robot.controller_states)], strict=True)
+        zip(robot.controller_states, y[position : position + len(robot.controller_states)], strict=True)
     )
     gap = y[-1] if robot.loose else None
     return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=gap, **controller_states)
@@ -112,23 +112,26 @@ moving = compiled(balances.moving_signals)
 
 
 @compiled
-def drive_rates(robot: Robot, conditions: Conditions, y: Unknowns, way: Scalar | None = None) -> Unknowns:
-    """Rates of change of the unknowns, in their units [1/s]. `way` as in `balances.moving_signals`, or `HELD`."""
-    is_standing = jnp.asarray(False if way is None else way == HELD)
+def drive_rates(robot: Robot, conditions: Conditions, y: Unknowns, direction: Scalar | None = None) -> Unknowns:
+    """Rates of change of the unknowns, in their units [1/s]. `direction`: as in `moving_signals`, or `HELD`."""
+    is_standing = jnp.asarray(False if direction is None else direction == HELD)
     state = state_of_unknowns(robot, y)
-    signals = moving(robot, conditions, state, None if way is None else jnp.where(is_standing, 0.0, way))
-    winding = signals.voltage_left / signals.inductance
-    shaft, moves = (
+    signals = moving(robot, conditions, state, None if direction is None else jnp.where(is_standing, 0.0, direction))
+    current_rate = signals.voltage_left / signals.inductance
+    motor_acceleration, acceleration = (
         jnp.where(is_standing, 0.0, x)
         for x in (signals.acceleration_wheel * robot.gearbox.ratio, signals.acceleration)
     )
     if conditions.motor_speed is not None:  # the current follows from torque, the shaft from the imposed speed
-        imposed = conditions.motor_acceleration
-        winding, shaft = jnp.zeros_like(winding), jnp.zeros_like(shaft) if imposed is None else imposed
+        imposed_acceleration = conditions.motor_acceleration
+        current_rate, motor_acceleration = (
+            jnp.zeros_like(current_rate),
+            jnp.zeros_like(motor_acceleration) if imposed_acceleration is None else imposed_acceleration,
+        )
     rates = [
-        winding,
-        shaft,
-        moves,
+        current_rate,
+        motor_acceleration,
+        acceleration,
         signals.speed,
         balances.charge_drawn(robot, conditions, signals.total_current),
         *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
@@ -145,38 +148,42 @@ def winding_rate(robot: Robot, conditions: Conditions, y: Unknowns) -> Array:
     return signals.voltage_left / signals.inductance / _UNITS[CURRENT]
 
 
-_norm = functools.partial(error_norm, own=len(_UNITS))
+_norm = functools.partial(error_norm, count=len(_UNITS))
 
 
 def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Unknowns:
     """Unknowns at rest. With `rolling`, the unknowns of steady travel, with settled memories of effects. If there is
     no steady travel, the unknowns at rest.
     """
-    size = jnp.asarray(drive_units(robot), jnp.result_type(conditions.voltage))
+    units = jnp.asarray(drive_units(robot), jnp.result_type(conditions.voltage))
     load = robot.chassis(conditions.configuration)
-    rest = jnp.zeros_like(size).at[4].set(conditions.discharge / size[4])
+    unknowns_at_rest = jnp.zeros_like(units).at[4].set(conditions.discharge / units[4])
     if conditions.motor_speed is not None:
-        rest = rest.at[1].set(conditions.motor_speed / size[1])
+        unknowns_at_rest = unknowns_at_rest.at[1].set(conditions.motor_speed / units[1])
         if not robot.has_ground:  # only a ground has a speed of grip
-            rest = rest.at[2].set(load.radius / robot.gearbox.ratio * conditions.motor_speed / size[2])
+            unknowns_at_rest = unknowns_at_rest.at[2].set(
+                load.radius / robot.gearbox.ratio * conditions.motor_speed / units[2]
+            )
     if robot.rig.begins is not None and conditions.begin is not None:
-        first = _initial_unknowns(robot, conditions)
-        angle = first[3] / load.radius
+        initial = _initial_unknowns(robot, conditions)
+        angle = initial[3] / load.radius
         memory = [effect.initial(robot, angle) for effect in robot.remembering]
-        begin = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
-        rest = rest.at[: len(begin)].set(begin / size[: len(begin)])
+        begin = jnp.stack([*initial, jnp.asarray(conditions.discharge, units.dtype), *memory])
+        unknowns_at_rest = unknowns_at_rest.at[: len(begin)].set(begin / units[: len(begin)])
     if robot.loose:
-        rest = rest.at[-1].set(load.twist(load.torque_load(rest[3] * size[3] / load.radius)) / size[-1])
+        unknowns_at_rest = unknowns_at_rest.at[-1].set(
+            load.twist(load.torque_load(unknowns_at_rest[3] * units[3] / load.radius)) / units[-1]
+        )
     if not rolling:
-        return rest
-    settled = operating_signals(robot, conditions)
-    memory = [effect.settled(robot, settled) for effect in robot.remembering]
-    state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
+        return unknowns_at_rest
+    signals = operating_signals(robot, conditions)
+    memory = [effect.settled(robot, signals) for effect in robot.remembering]
+    state = [signals.current, signals.speed_motor, signals.speed, 0.0, conditions.discharge, *memory]
     state += [jnp.zeros(())] * len(robot.controller_states)
     if robot.loose:
-        state += [load.twist(settled.torque_output)]
-    y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
-    return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
+        state += [load.twist(signals.torque_output)]
+    y = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
+    return jnp.where(jnp.all(jnp.isfinite(y)), y, unknowns_at_rest)
 
 
 def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
@@ -188,17 +195,18 @@ def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
     assert robot.rig.begins is not None and conditions.begin is not None
     begin = robot.rig.begins.of(conditions.begin)
     radius = robot.chassis(conditions.configuration).radius
-    turning = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
-    rolling, none = radius * turning / robot.gearbox.ratio, jnp.zeros(())
-    state_without_slip = State(none, turning, rolling, none, distance=radius * begin.angle)
+    motor_speed = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
+    speed = radius * motor_speed / robot.gearbox.ratio
+    zero = jnp.zeros(())
+    state_without_slip = State(zero, motor_speed, speed, zero, distance=radius * begin.angle)
     conditions = balances.with_controller_duty(robot, conditions, state_without_slip)
     voltage_left = voltage_at_rest(robot, conditions)
     if conditions.motor_current is None:  # an amplifier compensates it
         share = jnp.abs(balances.bridge_duty(robot, conditions)) if robot.driver.decay == FAST else 1.0
-        voltage_left = voltage_left - share * robot.motor.voltage_back(turning)
+        voltage_left = voltage_left - share * robot.motor.voltage_back(motor_speed)
     open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
     current = jnp.where(open_circuit, 0.0, robot.motor.current_stall(voltage_left))
-    return jnp.stack([jnp.asarray(x, float) for x in (current, turning, rolling, radius * begin.angle)])
+    return jnp.stack([jnp.asarray(x, float) for x in (current, motor_speed, speed, radius * begin.angle)])
 
 
 def drive(
@@ -237,17 +245,19 @@ def drive(
     is_speed_imposed = conditions.motor_speed is not None
     driven = rolling or is_speed_imposed or robot.controller is not None  # a controller may turn it later
     parked = jnp.asarray(False) if driven else holds(robot, conditions)
-    moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
-    run = robot, conditions, moves, y0, times, tolerance, max_steps
+    rate_factor = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
+    arguments = robot, conditions, rate_factor, y0, times, tolerance, max_steps
     sampled = robot.controller is not None and robot.controller.rate
-    ys, went = _integrate_samples(*run) if sampled else _integrate_unknowns(drive_rates, _norm, *run)
+    ys, reached_end = (
+        _integrate_samples(*arguments) if sampled else _integrate_unknowns(drive_rates, _norm, *arguments)
+    )
     signals = jax.vmap(lambda y: balances.moving_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
     if not is_speed_imposed:
-        static = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
-        signals = jax.tree.map(lambda rest, travel: jnp.where(parked, rest, travel), static, signals)
+        signals_at_rest = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
+        signals = jax.tree.map(lambda rest, travel: jnp.where(parked, rest, travel), signals_at_rest, signals)
     end = jax.tree.map(lambda x: x[-1], signals)
-    last = balances.with_controller_duty(robot, conditions, state_of_unknowns(robot, ys[-1]))
-    status = _status_of_run(robot, last, end, parked, went)
+    last_conditions = balances.with_controller_duty(robot, conditions, state_of_unknowns(robot, ys[-1]))
+    status = _status_of_run(robot, last_conditions, end, parked, reached_end)
     return _cut_at_empty_battery(
         robot,
         conditions,
@@ -260,27 +270,33 @@ def drive(
 
 
 def _cut_at_empty_battery(
-    robot: Robot, conditions: Conditions, times: Array, away: Array, signals: Signals, discharge: Scalar, end: Result
+    robot: Robot,
+    conditions: Conditions,
+    times: Array,
+    distance: Array,
+    signals: Signals,
+    discharge: Scalar,
+    end: Result,
 ) -> DriveTrajectory:
     """The recorded part of a run: it ends with an empty battery, and all later numbers are NaN.
 
     The parabola of the battery alone would continue.
     """
-    going = (conditions.battery < 0.5) | ~robot.battery.empty(discharge)
-    signals, away = jax.tree.map(
-        lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), (signals, away)
+    has_charge = (conditions.battery < 0.5) | ~robot.battery.empty(discharge)
+    signals, distance = jax.tree.map(
+        lambda x: jnp.where(has_charge.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), (signals, distance)
     )
     valid = (end.status != BATTERY_EMPTY) & (end.status != FAILED)
-    answer = withhold_numbers(end, valid, end.status != FAILED)
-    return DriveTrajectory(times, away, signals, answer)
+    result = withhold_numbers(end, valid, end.status != FAILED)
+    return DriveTrajectory(times, distance, signals, result)
 
 
 def _integrate_unknowns(
-    law: Callable[[Robot, Conditions, Array], Array],
-    size: Callable[[Array], Scalar],
+    rates: Callable[[Robot, Conditions, Array], Array],
+    norm: Callable[[Array], Scalar],
     robot: Robot,
     conditions: Conditions,
-    moves: Array | float,
+    rate_factor: Array | float,
     y0: Array,
     times: Array,
     tolerance: float,
@@ -290,9 +306,9 @@ def _integrate_unknowns(
     """Unknowns at the given times, and True if the integrator reached the last one.
 
     Args:
-        law: function that returns the rates of the unknowns.
-        size: function that returns the norm of an error of the unknowns.
-        moves: 0 for robots that stay at rest, otherwise 1.
+        rates: function that returns the rates of the unknowns.
+        norm: function that returns the norm of an error of the unknowns.
+        rate_factor: 0 for robots that stay at rest, otherwise 1.
         currents: number of currents, the first of the unknowns.
     """
     import diffrax  # only here: the import takes half a second
@@ -300,18 +316,18 @@ def _integrate_unknowns(
     from mmrjax.numerics.rodas import Rodas4
 
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda _, y, run: law(run[0], run[1], y) * run[2]),
+        diffrax.ODETerm(lambda _, y, run: rates(run[0], run[1], y) * run[2]),
         Rodas4(lambda y, run: jnp.abs(y[:currents]) * _UNITS[CURRENT] > run[0].driver.current_limit),
         times[0],
         times[-1],
         dt0=jnp.asarray(1e-4, y0.dtype),
         y0=y0,
-        args=(robot, conditions, moves),
+        args=(robot, conditions, rate_factor),
         saveat=diffrax.SaveAt(ts=times),
         max_steps=max_steps,
         throw=False,
         stepsize_controller=diffrax.PIDController(
-            rtol=tolerance, atol=tolerance, norm=size, dtmax=step_longest(robot, conditions)
+            rtol=tolerance, atol=tolerance, norm=norm, dtmax=step_longest(robot, conditions)
         ),
         adjoint=diffrax.ForwardMode(),
     )
@@ -320,26 +336,32 @@ def _integrate_unknowns(
 
 
 def _integrate_samples(
-    robot: Robot, conditions: Conditions, moves: Array, y0: Array, times: Array, tolerance: float, max_steps: int
+    robot: Robot,
+    conditions: Conditions,
+    rate_factor: Array,
+    y0: Array,
+    times: Array,
+    tolerance: float,
+    max_steps: int,
 ) -> tuple[Float[Array, "times unknowns"], Array]:
     """`_integrate_unknowns` for a controller with a rate: from one sample or requested time to the next."""
 
-    def onward(carry: tuple[Array, Array, Array], end: Array) -> tuple[tuple[Array, Array, Array], Array]:
-        def part(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            time, y, went = carry
+    def to_requested_time(carry: tuple[Array, Array, Array], end: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        def to_next_sample(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            time, y, reached_end = carry
             y = sampled_unknowns(robot, conditions, y)
             until = jnp.minimum(end, time + jnp.asarray(state_of_unknowns(robot, y).clock))
             span = jnp.stack([time, until])
             ys, reached = _integrate_unknowns(
-                drive_rates, _norm, robot, conditions, moves, y, span, tolerance, max_steps
+                drive_rates, _norm, robot, conditions, rate_factor, y, span, tolerance, max_steps
             )
-            return until, ys[-1], went & reached
+            return until, ys[-1], reached_end & reached
 
-        carry = jax.lax.while_loop(lambda carry: carry[0] < end, part, carry)
+        carry = jax.lax.while_loop(lambda carry: carry[0] < end, to_next_sample, carry)
         return carry, sampled_unknowns(robot, conditions, carry[1])
 
-    (_, _, went), ys = jax.lax.scan(onward, (times[0], y0, jnp.asarray(True)), times)
-    return ys, went
+    (_, _, reached_end), ys = jax.lax.scan(to_requested_time, (times[0], y0, jnp.asarray(True)), times)
+    return ys, reached_end
 
 
 def _drive_turning(
@@ -348,25 +370,35 @@ def _drive_turning(
     """`drive` for a robot with independently driven sides. Its signals have a last axis of left and right side."""
     y0 = circling.turning_start(robot, conditions, rolling)
     parked = jnp.asarray(False) if rolling else circling.holds(robot, conditions)
-    moves = jnp.where(parked, circling.changing_at_rest(y0), 1.0)
-    ys, went = _integrate_unknowns(
-        circling.turning_rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps, len(SIDES)
+    rate_factor = jnp.where(parked, circling.changing_at_rest(y0), 1.0)
+    ys, reached_end = _integrate_unknowns(
+        circling.turning_rates,
+        circling.norm,
+        robot,
+        conditions,
+        rate_factor,
+        y0,
+        times,
+        tolerance,
+        max_steps,
+        len(SIDES),
     )
     motion = jax.vmap(lambda y: circling.motion_of_unknowns(robot, y))(ys)
     travel = jax.vmap(lambda m: balances.turning_signals(robot, conditions, m))(motion)
     end = jax.tree.map(lambda x: x[-1], (travel, motion))
     status = jnp.where(parked, STALLED, circling.status_after_run(robot, conditions, *end))
-    status = jnp.where(went, status, FAILED)
-    away, answer = jnp.hypot(motion.place_x, motion.place_y), circling.result_of_turn(robot, end[0], status)
-    return _cut_at_empty_battery(robot, conditions, times, away, travel.signals, motion.discharge, answer)
+    status = jnp.where(reached_end, status, FAILED)
+    distance = jnp.hypot(motion.place_x, motion.place_y)
+    result = circling.result_of_turn(robot, end[0], status)
+    return _cut_at_empty_battery(robot, conditions, times, distance, travel.signals, motion.discharge, result)
 
 
-def _status_of_run(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
+def _status_of_run(robot: Robot, conditions: Conditions, end: Signals, parked: Array, reached_end: Array) -> Array:
     voltage = voltage_at_rest(robot, conditions) if conditions.voltage_follows else end.voltage
     status = status_moving(robot, conditions, end, voltage)
     status = jnp.where(parked, STALLED, status)
     status = jnp.where(robot.battery.emptied(conditions.battery, end.discharge), BATTERY_EMPTY, status)
-    return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
+    return jnp.where(reached_end & jnp.isfinite(end.speed), status, FAILED)
 
 
 @compiled
@@ -385,7 +417,7 @@ def _settled_results(robot: Robot, conditions: Conditions) -> Result:
     # A table of settled runs does not record their starts. A start from standstill slides first, at μ_d; on a slope
     # between μ_d and μ_s it never grips, although it was measured there. Hence a rolling start, as in `track`.
     times = jnp.asarray([0.0, TIME_SETTLED])
-    return jax.vmap(lambda c: drive(robot, c, times, rolling=True).result)(conditions)
+    return jax.vmap(lambda one: drive(robot, one, times, rolling=True).result)(conditions)
 
 
 def _run_batch(
@@ -398,9 +430,9 @@ def _run_histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> RunBatch:
     duration = options["duration"]  # times are denser while the current rises to its peak
-    early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
-    first = np.linspace(0.0, min(TIME_RISE, duration), SAMPLES_RISE, endpoint=False)
-    times = np.unique(np.round(np.concatenate([first, early, np.linspace(0.0, duration, SAMPLES)]), 9))
+    inrush = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
+    rise = np.linspace(0.0, min(TIME_RISE, duration), SAMPLES_RISE, endpoint=False)
+    times = np.unique(np.round(np.concatenate([rise, inrush, np.linspace(0.0, duration, SAMPLES)]), 9))
     histories = drive_batch(robot, conditions, jnp.asarray(times))
     return RunBatch(
         histories.result, history=History.of(robot, histories.time, histories.distance, histories.signals)
@@ -426,12 +458,12 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
     comes from the balances and includes a battery or an effect that changes the slope.
     """
 
-    def left(current: Array) -> Array:
-        total = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
-        shifted = replace(signals, current=current, total_current=total)
+    def voltage_left(current: Array) -> Array:
+        total_current = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
+        shifted = replace(signals, current=current, total_current=total_current)
         return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
 
-    voltage, slope = value_and_slope(left, signals.current)
+    voltage, slope = value_and_slope(voltage_left, signals.current)
     z = step * slope / signals.inductance
     return signals.current + step / signals.inductance * voltage * jnp.expm1(z) / z
 

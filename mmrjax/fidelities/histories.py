@@ -51,13 +51,13 @@ from mmrjax.numerics.rosenbrock import Unknowns
 T = TypeVar("T")
 
 _GAMMA = 1 - 0.5**0.5
-#: Consecutive parts of a step that its stages weigh, as shares.
+#: Lengths of the two parts of a step, one for each stage, as shares of the step.
 _WEIGHED = np.array([1 - _GAMMA, _GAMMA])
 #: Most Newton steps of a stage, which starts from the solution of the last one, and the residual allowed, in the
 #: units of the unknowns (10 A, 1000 rad/s, 1 m/s).
 NEWTON, SOLVED = 30, 1e-9
-#: First step [s] and growth of the steps with time [1/s · s]: after the start of a robot that may slide on its
-#: ground, and after a change of the input by its largest value or the start of a shaft.
+#: First step [s] and growth of the steps with time [-]. `START`: after the start of a robot that may slide on its
+#: ground. `CHANGE`: after the start of a shaft, or a change of the input by its largest value.
 START, CHANGE = (1e-5, 0.02), (1e-4, 0.25)
 #: The second pair for a load with backlash; and the longest step [s].
 LOOSE, LONGEST = (1e-5, 0.08), 2.5e-3
@@ -97,19 +97,23 @@ def time_grid(
     changes = np.zeros(0) if changes is None else np.asarray(changes, float)
     sizes = np.ones(len(changes)) if sizes is None else np.asarray(sizes, float)
     is_inside = (changes > 0) & (changes < last)
-    begins, first = np.append(0.0, changes[is_inside]), np.append(start[0], change[0] / sizes[is_inside])
-    grows = np.append(start[1], np.full(is_inside.sum(), change[1]))
-    requested_times, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
+    grow_starts, first_steps = np.append(0.0, changes[is_inside]), np.append(start[0], change[0] / sizes[is_inside])
+    growth = np.append(start[1], np.full(is_inside.sum(), change[1]))
+    requested_times, times = times, np.unique(np.concatenate([grow_starts, np.asarray(times, float)]))
     longest = np.maximum(longest, last / STEPS) if np.size(longest) else LONGEST  # one row has no interval
     longest = np.broadcast_to(longest, max(len(requested_times) - 1, 1))
     longest = longest[np.clip(np.searchsorted(requested_times, times[:-1], side="right") - 1, 0, len(longest) - 1)]
-    interval_index = np.searchsorted(begins, times[:-1], side="right") - 1  # the last change before each instant
-    interval_start, first, grows = begins[interval_index], first[interval_index], grows[interval_index]
-    knee = np.maximum((longest - first) / grows, 0.0)
+    interval_index = np.searchsorted(grow_starts, times[:-1], side="right") - 1  # the last change before each instant
+    interval_start, first_steps, growth = (
+        grow_starts[interval_index],
+        first_steps[interval_index],
+        growth[interval_index],
+    )
+    knee = np.maximum((longest - first_steps) / growth, 0.0)
 
     def step_count(t: np.ndarray) -> np.ndarray:  # number of steps up to t: ∫ dt / min(longest, first + grows t)
-        young = np.log1p(grows * np.minimum(t, knee) / first) / grows
-        return young + np.maximum(t - knee, 0.0) / longest
+        growing_steps = np.log1p(growth * np.minimum(t, knee) / first_steps) / growth
+        return growing_steps + np.maximum(t - knee, 0.0) / longest
 
     begin_count, end_count, knee_count = map(
         step_count, (times[:-1] - interval_start, times[1:] - interval_start, knee)
@@ -118,8 +122,8 @@ def time_grid(
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(end_count[k] - begin_count[k] - 1e-9)))
         counts = np.linspace(begin_count[k], end_count[k], count, endpoint=False)
-        young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(counts, knee_count[k]))
-        instants.append(interval_start[k] + young + np.maximum(counts - knee_count[k], 0.0) * longest[k])
+        growing_time = first_steps[k] / growth[k] * np.expm1(growth[k] * np.minimum(counts, knee_count[k]))
+        instants.append(interval_start[k] + growing_time + np.maximum(counts - knee_count[k], 0.0) * longest[k])
         instants[-1][0] = times[k]
     all_instants = np.concatenate([*instants, times[-1:]])
     return np.interp(
@@ -147,8 +151,8 @@ class LinearisedRun(eqx.Module):
 
     Attributes:
         begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
-        places: unknowns at both stages, where the equations are linearised, shape (steps, 2, unknowns).
-        sides: see `RunStates`.
+        stage_unknowns: unknowns at both stages, where the equations are linearised, shape (steps, 2, unknowns).
+        directions: see `RunStates`.
         passes: True for steps in which a shaft stops or leaves rest.
         clock: start of a step, and the times of its stages [s], shape (steps, 3).
         sampled: for a controller with a rate, unknowns before each step, which a sample changes, and the factor of
@@ -157,8 +161,8 @@ class LinearisedRun(eqx.Module):
 
     begins: Float[Array, "steps unknowns"]
     ends: Float[Array, "steps unknowns"]
-    places: Float[Array, "steps 2 unknowns"]
-    sides: Float[Array, "steps 2"]
+    stage_unknowns: Float[Array, "steps 2 unknowns"]
+    directions: Float[Array, "steps 2"]
     passes: Bool[Array, " steps"]
     clock: Float[Array, "steps 3"]
     carries: Float[Array, "steps unknowns unknowns"]
@@ -219,7 +223,7 @@ class RunStep(eqx.Module):
     before: Conditions | None
     now: Conditions
 
-    def held(self, constant: Conditions) -> Conditions:
+    def all_conditions(self, constant: Conditions) -> Conditions:
         """All conditions during the step."""
         return eqx.combine(self.now, constant)
 
@@ -232,11 +236,11 @@ class RunStep(eqx.Module):
         follows. Before a run the input is 0.
         """
         if self.before is None:
-            return jnp.zeros((0, *rate(y, self.held(constant)).shape))
-        now = self.held(constant)
+            return jnp.zeros((0, *rate(y, self.all_conditions(constant)).shape))
+        now = self.all_conditions(constant)
         before = eqx.combine(self.before, constant)
-        nothing = [x if x is None else self.begun * x for x in (before.duty, before.motor_current)]
-        before = eqx.tree_at(lambda c: [c.duty, c.motor_current], before, nothing, is_leaf=lambda x: x is None)
+        inputs_before = [x if x is None else self.begun * x for x in (before.duty, before.motor_current)]
+        before = eqx.tree_at(lambda c: [c.duty, c.motor_current], before, inputs_before, is_leaf=lambda x: x is None)
         states = jnp.stack([y, y, y + MORE * _unit_vector_of_current(y)])
         stacked = jax.tree.map(lambda before, now: jnp.stack([before, now, now]), before, now)
         return jax.vmap(rate)(states, stacked)
@@ -258,22 +262,20 @@ def run_steps(conditions: Conditions, times: Times) -> tuple[RunStep, Conditions
     now = jax.tree.map(lambda x: x[:-1], changing)
     if changing.motor_speed is not None and now.motor_acceleration is not None:
         now = eqx.tree_at(lambda c: c.motor_acceleration, now, _slopes(changing.motor_speed, times))
-    jumped = jnp.zeros(len(times) - 1, bool)
+    has_jumped = jnp.zeros(len(times) - 1, bool)
     for x in (getattr(now, name) for name in DRIVING):
         if x is not None:
-            jumped |= jnp.concatenate([jnp.zeros(1, bool), x[1:] != x[:-1]])
-    jump = jax.lax.cummax(jnp.where(jumped, jnp.arange(len(jumped)), 0))
-    before = jax.tree.map(lambda x: x[jnp.maximum(jump - 1, 0)], now)
-    rests = conditions.begin is None
-    is_moving = jnp.where((jump == 0) & rests, 0.0, 1.0).astype(times.dtype)
-    since = times[:-1] - times[jump]
-    return RunStep(
-        jnp.diff(times), since, is_moving, before if conditions.motor_speed is None else None, now
-    ), constant
+            has_jumped |= jnp.concatenate([jnp.zeros(1, bool), x[1:] != x[:-1]])
+    jump_index = jax.lax.cummax(jnp.where(has_jumped, jnp.arange(len(has_jumped)), 0))
+    before = jax.tree.map(lambda x: x[jnp.maximum(jump_index - 1, 0)], now)
+    starts_at_rest = conditions.begin is None
+    begun = jnp.where((jump_index == 0) & starts_at_rest, 0.0, 1.0).astype(times.dtype)
+    since = times[:-1] - times[jump_index]
+    return RunStep(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
 
 
 def _lag_of_step(
-    rate: Float[Array, " rates"],
+    rates: Float[Array, " rates"],
     step: RunStep,
     current: Scalar,
     limit: Scalar,
@@ -285,28 +287,28 @@ def _lag_of_step(
     `parts` and `wait` as of `_decay_over_parts`. None if the driver's limit acts on the `current`, which then follows
     the limit at once.
     """
-    if not len(rate):
+    if not len(rates):
         return _decay_over_parts(jnp.zeros(()), jnp.zeros(()), parts, wait)
-    slope = (rate[1] - rate[2]) / MORE
-    follows = slope > 0  # except when a diode begins to block
-    decay = jnp.where(follows, slope, 1.0)
-    transient = (rate[0] - rate[1]) / decay * jnp.exp(-decay * step.since)
-    follows &= jax.lax.stop_gradient(jnp.abs(current - transient)) <= limit
-    return _decay_over_parts(jnp.where(follows, transient, 0.0), decay, parts, wait)
+    slope = (rates[1] - rates[2]) / MORE
+    decays = slope > 0  # except when a diode begins to block
+    decay = jnp.where(decays, slope, 1.0)
+    transient = (rates[0] - rates[1]) / decay * jnp.exp(-decay * step.since)
+    decays &= jax.lax.stop_gradient(jnp.abs(current - transient)) <= limit
+    return _decay_over_parts(jnp.where(decays, transient, 0.0), decay, parts, wait)
 
 
 def _decay_over_parts(begin: Array, decay: Array, parts: Pair, wait: Scalar = 0.0) -> CurrentLag:
     """Lag in two parts of a step [s], from its value at the start. `wait` lies between them [s]."""
-    second = parts[0] + wait
-    currents = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), second]))
+    second_start = parts[0] + wait
+    begins = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), second_start]))
     z = decay * parts
-    means = jnp.where(z > 0, -jnp.expm1(-z) / jnp.where(z > 0, z, 1.0), 1.0) * currents
-    return CurrentLag(begin, means, begin * jnp.exp(-decay * (second + parts[1])), decay)
+    means = jnp.where(z > 0, -jnp.expm1(-z) / jnp.where(z > 0, z, 1.0), 1.0) * begins
+    return CurrentLag(begin, means, begin * jnp.exp(-decay * (second_start + parts[1])), decay)
 
 
 def _lag_rates(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Float[Array, " rates"]:
     """Rates that determine the lag of a step, see `RunStep.rates_at_start`."""
-    return step.rates_at_start(constant, lambda y, held: winding_rate(robot, held, y), y)
+    return step.rates_at_start(constant, lambda y, conditions: winding_rate(robot, conditions, y), y)
 
 
 def _lag_of_robot(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> CurrentLag:
@@ -321,21 +323,21 @@ def _current_limit(robot: Robot) -> Scalar:
 
 
 def _solve_stage(
-    law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array
+    rates: Callable[[Array], Array], offset: Array, guess: Array, h: Array, lag_mean: Array, decay: Array
 ) -> Array:
     """Solves Y = known + γ h f(Y) for the unknowns without the lag. The lag acts by its mean."""
-    known = known + _GAMMA * h * decay * mean
+    offset = offset + _GAMMA * h * decay * lag_mean
 
-    def left(y: Array) -> Array:
-        return y - known - _GAMMA * h * law(y + mean)
+    def residual(y: Array) -> Array:
+        return y - offset - _GAMMA * h * rates(y + lag_mean)
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, y, _ = state
-        matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(y)
+        matrix, value = jax.jacfwd(lambda y: (residual(y),) * 2, has_aux=True)(y)
         step = solve(matrix, value)
         # Over a kink of the friction law full steps can alternate without end.
         trials = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
-        residual_size = jnp.max(jnp.abs(jax.vmap(left)(trials)), 1)
+        residual_size = jnp.max(jnp.abs(jax.vmap(residual)(trials)), 1)
         best = jnp.where(residual_size[0] < residual_size[1], trials[0], trials[1])
         return (
             count + 1,
@@ -343,10 +345,10 @@ def _solve_stage(
             jnp.min(residual_size),
         )
 
-    def going(state: tuple[Array, Array, Array]) -> Array:
+    def is_unsolved(state: tuple[Array, Array, Array]) -> Array:
         return (state[0] < NEWTON) & (state[2] > SOLVED)
 
-    _, y, error = jax.lax.while_loop(going, newton, (jnp.asarray(0), guess, jnp.asarray(jnp.inf, guess.dtype)))
+    _, y, error = jax.lax.while_loop(is_unsolved, newton, (jnp.asarray(0), guess, jnp.asarray(jnp.inf, guess.dtype)))
     return jnp.where(error <= SOLVED, y, jnp.nan)
 
 
@@ -356,8 +358,8 @@ class RunStates(eqx.Module):
     Attributes:
         stages: unknowns at both stages of every step, without lags.
         ends: states at the end of each step.
-        sides: direction of a shaft (see `shaft_direction`) at the start and end of a step. They differ if it stops or
-            leaves rest within the step.
+        directions: directions of a shaft (see `shaft_direction`) at the start and end of a step. They differ if it
+            stops or leaves rest within the step.
         before: time in such a step until it stops, or leaves rest [s].
         since: start of the last part of a step [s], later if friction holds the shaft after it stops.
         rest: unknowns at that moment.
@@ -365,7 +367,7 @@ class RunStates(eqx.Module):
 
     stages: Float[Array, "steps 2 unknowns"]
     ends: Float[Array, "steps unknowns"]
-    sides: Float[Array, "steps 2"]
+    directions: Float[Array, "steps 2"]
     before: Float[Array, " steps"]
     since: Float[Array, " steps"]
     rest: Float[Array, "steps unknowns"]
@@ -375,22 +377,22 @@ class _StepPart(eqx.Module):
     """A step, or its part before or after a shaft stops, or while it waits at rest.
 
     Attributes:
-        turn: 0 for the whole step, 1 to `TURNS` for iterations of the part before rest. Then `WAITS` while friction
+        phase: 0 for the whole step, 1 to `TURNS` for iterations of the part before rest. Then `WAITS` while friction
             still holds the shaft, and the remaining part.
         begin: unknowns at its start.
         lag: lag of the current at its start.
         since, length: start and length of the part [s].
-        side, then: direction in which a shaft turns, and after it has waited.
+        direction, next_direction: direction in which a shaft turns, and after it has waited.
         before, stages, end: see `RunStates`.
     """
 
-    turn: Array
+    phase: Array
     begin: Unknowns
     lag: Array
     since: Array
     length: Array
-    side: Array
-    then: Array
+    direction: Array
+    next_direction: Array
     before: Array
     stages: Float[Array, "2 unknowns"]
     end: Unknowns
@@ -406,104 +408,119 @@ def solve_states(robot: Robot, conditions: Conditions, times: Times) -> RunState
     Args: as for `history_signals`.
     """
     steps, constant = run_steps(conditions, times)
-    of_first, first_state = first_conditions_and_state(robot, conditions)
+    first_conditions, first_state = first_conditions_and_state(robot, conditions)
     # change of the unknowns with motor speed when shafts and robot move as one, in their units
-    size, per_speed = drive_units(robot), robot.chassis(of_first.configuration).radius / robot.gearbox.ratio
-    along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
+    units = drive_units(robot)
+    travel_per_motor_angle = robot.chassis(first_conditions.configuration).radius / robot.gearbox.ratio
+    joint_motion = (
+        jnp.zeros(len(units)).at[MOTOR].set(1.0).at[GROUND].set(travel_per_motor_angle * units[MOTOR] / units[GROUND])
+    )
 
-    def taken(y: Array, step: RunStep) -> tuple[Array, RunStates]:
-        conditions = step.held(constant)
+    def take_step(y: Array, step: RunStep) -> tuple[Array, RunStates]:
+        conditions = step.all_conditions(constant)
         y = _at_start_of_step(robot, conditions, step.length, y)
         lag = _lag_of_robot(robot, constant, step, y)
-        law = functools.partial(drive_rates, robot, conditions)
+        rates = functools.partial(drive_rates, robot, conditions)
 
-        def turned(part: _StepPart) -> _StepPart:
+        def next_part(part: _StepPart) -> _StepPart:
             part_lag = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
-            first = part.begin - part_lag.begin * _unit_vector_of_current(y)
+            part_begin = part.begin - part_lag.begin * _unit_vector_of_current(y)
 
-            def solve_next_stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
-                now = functools.partial(law, way=part.side)
+            def solve_next_stage(starts: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
+                rates_in_direction = functools.partial(rates, direction=part.direction)
                 stage_result = _solve_stage(
-                    now, *given, part.length, mean * _unit_vector_of_current(y), part_lag.decay
+                    rates_in_direction, *starts, part.length, mean * _unit_vector_of_current(y), part_lag.decay
                 )
-                return (first + (1 - _GAMMA) / _GAMMA * (stage_result - first), stage_result), stage_result
+                return (part_begin + (1 - _GAMMA) / _GAMMA * (stage_result - part_begin), stage_result), stage_result
 
-            stages = jax.lax.scan(solve_next_stage, (first, first), part_lag.means)[1]
+            stages = jax.lax.scan(solve_next_stage, (part_begin, part_begin), part_lag.means)[1]
             end = stages[1] + part_lag.end * _unit_vector_of_current(y)
-            before, after = part.begin[MOTOR], end[MOTOR]
-            nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
-            rests, waited, rest = part.turn == TURNS, part.turn == WAITS, end - after * along
-            transient_drop = before - after  # 0 in a part of no length, of a step that begins at rest
-            on_line = part.length * before / jnp.where(transient_drop == 0, 1.0, transient_drop)
-            slows = law(end, way=part.side)[MOTOR]
-            by_newton = part.length - after / jnp.where(slows == 0, 1.0, slows)
-            to_rest = jnp.clip(jnp.where(part.turn == 0, on_line, by_newton), 0.0, step.length)
-            since = part.since + jnp.where(rests | waited, part.length, 0.0)
-            side, then, wait = _shaft_side(robot, conditions, rest, step.length - since)
-            step_left = jnp.where(rests & (wait > 0), wait, step.length - since)
-            after_rest = jnp.where(wait > 0, WAITS, WAITS + 1)
+            speed_before, speed_after = part.begin[MOTOR], end[MOTOR]
+            seeks_rest = jnp.where(part.phase == 0, part.direction * speed_after < 0, part.phase < TURNS)
+            comes_to_rest, has_waited, unknowns_at_rest = (
+                part.phase == TURNS,
+                part.phase == WAITS,
+                end - speed_after * joint_motion,
+            )
+            speed_drop = speed_before - speed_after  # 0 in a part of no length, of a step that begins at rest
+            time_on_line = part.length * speed_before / jnp.where(speed_drop == 0, 1.0, speed_drop)
+            motor_acceleration = rates(end, direction=part.direction)[MOTOR]
+            time_by_newton = part.length - speed_after / jnp.where(motor_acceleration == 0, 1.0, motor_acceleration)
+            time_to_rest = jnp.clip(jnp.where(part.phase == 0, time_on_line, time_by_newton), 0.0, step.length)
+            since = part.since + jnp.where(comes_to_rest | has_waited, part.length, 0.0)
+            direction, next_direction, wait = _direction_in_part(
+                robot, conditions, unknowns_at_rest, step.length - since
+            )
+            length_left = jnp.where(comes_to_rest & (wait > 0), wait, step.length - since)
+            phase_after_rest = jnp.where(wait > 0, WAITS, WAITS + 1)
             return _StepPart(
-                jnp.where(nears, part.turn + 1, jnp.where(rests, after_rest, WAITS + 2 - waited)),
-                jnp.where(rests, rest, jnp.where(waited, end, part.begin)),
-                jnp.where(rests | waited, part_lag.end, part.lag),
+                jnp.where(
+                    seeks_rest, part.phase + 1, jnp.where(comes_to_rest, phase_after_rest, WAITS + 2 - has_waited)
+                ),
+                jnp.where(comes_to_rest, unknowns_at_rest, jnp.where(has_waited, end, part.begin)),
+                jnp.where(comes_to_rest | has_waited, part_lag.end, part.lag),
                 since,
-                jnp.where(nears, to_rest, step_left),
-                jnp.where(rests, side, jnp.where(waited, part.then, part.side)),
-                jnp.where(rests, then, part.then),
-                jnp.where(rests, part.length, part.before),
+                jnp.where(seeks_rest, time_to_rest, length_left),
+                jnp.where(comes_to_rest, direction, jnp.where(has_waited, part.next_direction, part.direction)),
+                jnp.where(comes_to_rest, next_direction, part.next_direction),
+                jnp.where(comes_to_rest, part.length, part.before),
                 stages,
                 end,
             )
 
-        side, then, wait = _shaft_side(robot, conditions, y, step.length)
-        turn, length, none = jnp.where(wait > 0, WAITS, 0), jnp.where(wait > 0, wait, step.length), jnp.zeros(())
-        whole_step = _StepPart(turn, y, lag.begin, none, length, side, then, wait, jnp.stack([y, y]), y)
-        last = jax.lax.while_loop(lambda part: part.turn < WAITS + 2, turned, whole_step)
-        sides = jnp.stack([side, last.side])
-        return last.end, RunStates(last.stages, last.end, sides, last.before, last.since, last.begin)
+        direction, next_direction, wait = _direction_in_part(robot, conditions, y, step.length)
+        phase = jnp.where(wait > 0, WAITS, 0)
+        length = jnp.where(wait > 0, wait, step.length)
+        zero = jnp.zeros(())
+        whole_step = _StepPart(
+            phase, y, lag.begin, zero, length, direction, next_direction, wait, jnp.stack([y, y]), y
+        )
+        last = jax.lax.while_loop(lambda part: part.phase < WAITS + 2, next_part, whole_step)
+        directions = jnp.stack([direction, last.direction])
+        return last.end, RunStates(last.stages, last.end, directions, last.before, last.since, last.begin)
 
-    return jax.lax.scan(taken, first_state, steps)[1]
+    return jax.lax.scan(take_step, first_state, steps)[1]
 
 
-def _shaft_side(robot: Robot, conditions: Conditions, y: Array, length: Array) -> tuple[Array, Array, Array]:
+def _direction_in_part(robot: Robot, conditions: Conditions, y: Array, length: Array) -> tuple[Array, Array, Array]:
     """Direction of a shaft in a part of a step, after it has waited, and that time (see `shaft_direction`).
 
     0 if shafts and load stop separately. It waits at most for the part's length [s].
     """
     if not robot.moves_as_one:
         return jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
-    way, wait = shaft_direction(robot, conditions, state_of_unknowns(robot, y))
-    way, wait = jnp.where(wait <= length, way, HELD), jnp.where(wait <= length, wait, 0.0)
-    return jnp.where(wait > 0, HELD, way), way, wait
+    direction, wait = shaft_direction(robot, conditions, state_of_unknowns(robot, y))
+    direction, wait = jnp.where(wait <= length, direction, HELD), jnp.where(wait <= length, wait, 0.0)
+    return jnp.where(wait > 0, HELD, direction), direction, wait
 
 
 def linearise_run(
-    robot: Robot, conditions: Conditions, times: Times, known: RunStates | None = None
+    robot: Robot, conditions: Conditions, times: Times, states: RunStates | None = None
 ) -> LinearisedRun:
     """A solved run, with its equations linearised along it.
 
-    Args: as for `history_signals`, and `known`: its states, if computed.
+    Args: as for `history_signals`, and `states`: its states, if computed.
     """
-    run = solve_states(robot, conditions, times) if known is None else known
+    run = solve_states(robot, conditions, times) if states is None else states
     steps, constant = run_steps(conditions, times)
     first_state = first_conditions_and_state(robot, conditions)[1]
     before = jnp.concatenate([first_state[None], run.ends[:-1]])
-    start = lambda step, y: _at_start_of_step(robot, step.held(constant), step.length, y)  # noqa: E731
-    begins = jax.vmap(start)(steps, before)
+    start_of_step = lambda step, y: _at_start_of_step(robot, step.all_conditions(constant), step.length, y)  # noqa: E731
+    begins = jax.vmap(start_of_step)(steps, before)
     sampled = robot.controller is not None and robot.controller.rate > 0
     # A step to rest and the one from it use an approximant of the exponential. For a current that lags by a quarter
     # of such a part, implicit Euler would keep a fifth of the decayed excess.
-    passes = (run.sides[:, 0] != run.sides[:, 1]) | (run.since > 0)
+    passes = (run.directions[:, 0] != run.directions[:, 1]) | (run.since > 0)
     h = steps.length
     spans = jnp.where(passes[:, None], jnp.stack([run.before, h - run.since], 1), _GAMMA * h[:, None])
-    rests = run.rest, jnp.where(passes, run.since - run.before, 0.0)
+    rest_and_wait = run.rest, jnp.where(passes, run.since - run.before, 0.0)
     middle = times[:-1] + spans[:, 0]
     clock = jnp.stack([times[:-1], middle, times[1:]], 1)
 
-    def linear(given: tuple) -> tuple[Array, Array, Array, Array, Array | None]:
-        before, begin, end, stages, (rest, wait), sides, spans, passes, step = given
-        conditions = step.held(constant)
-        one = jnp.eye(len(end), dtype=end.dtype)
+    def linearise_step(inputs: tuple) -> tuple[Array, Array, Array, Array, Array | None]:
+        before, begin, end, stages, (rest, wait), directions, spans, passes, step = inputs
+        conditions = step.all_conditions(constant)
+        identity = jnp.eye(len(end), dtype=end.dtype)
         current = _unit_vector_of_current(end)
 
         lag_by_begin, rate = jax.jacfwd(lambda y: (_lag_rates(robot, constant, step, y),) * 2, has_aux=True)(begin)
@@ -512,16 +529,21 @@ def linearise_run(
         by_rate, lag = jax.jacfwd(lagging, has_aux=True)(rate)
         lags = jnp.stack([lag.begin, lag.begin * jnp.exp(-lag.decay * (spans[0] + wait)), lag.end])
         ends = jnp.stack([begin, rest, end]) - lags[:, None] * current
-        places = jnp.where(passes, (ends[1:] + ends[:-1]) / 2, stages) + lag.means[:, None] * current
-        slopes = jax.vmap(jax.jacfwd(lambda y, way: drive_rates(robot, conditions, y, way)))(places, sides)
+        stage_unknowns = jnp.where(passes, (ends[1:] + ends[:-1]) / 2, stages) + lag.means[:, None] * current
+        slopes = jax.vmap(jax.jacfwd(lambda y, direction: drive_rates(robot, conditions, y, direction)))(
+            stage_unknowns, directions
+        )
         z = spans[:, None, None] * slopes
-        weight = jnp.where(passes, one - z / 2 + z @ z / 6, one)  # Padé (0, 3): 1 / (1 - z + z²/2 - z³/6)
-        first, second = jax.vmap(invert)(one - z @ weight)
-        stops, ways = passes & (sides[0] != HELD), sides.at[1].set(jnp.where(wait > 0, HELD, sides[1]))
-        jump = compute_if_needed(stops, _sensitivity_jump, (robot, conditions, rest, ways), jnp.zeros_like(end))
+        weight = jnp.where(passes, identity - z / 2 + z @ z / 6, identity)  # Padé (0, 3): 1 / (1 - z + z²/2 - z³/6)
+        first, second = jax.vmap(invert)(identity - z @ weight)
+        passes_rest = passes & (directions[0] != HELD)
+        directions_at_rest = directions.at[1].set(jnp.where(wait > 0, HELD, directions[1]))
+        jump = compute_if_needed(
+            passes_rest, _sensitivity_jump, (robot, conditions, rest, directions_at_rest), jnp.zeros_like(end)
+        )
         # The start of the second stage depends on the first stage and on the change before the step.
-        by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
-        by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
+        by_first = jnp.where(passes, identity + jump[:, None] * identity[MOTOR], (1 - _GAMMA) / _GAMMA * identity)
+        by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * identity
         carried_first = by_first @ first
         carries = second @ (carried_first + by_before)
         gains = jnp.stack([spans[0] * second @ carried_first, spans[1] * second]) @ weight
@@ -532,15 +554,23 @@ def linearise_run(
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
         carries = carries + lags.T @ lag_by_begin
         if not sampled:
-            return places, _stopped_by_clamp(conditions, carries.T).T, gains, lags, None
-        return places, carries @ jax.jacfwd(functools.partial(start, step))(before), gains, lags, carries
+            return stage_unknowns, _stopped_by_clamp(conditions, carries.T).T, gains, lags, None
+        return (
+            stage_unknowns,
+            carries @ jax.jacfwd(functools.partial(start_of_step, step))(before),
+            gains,
+            lags,
+            carries,
+        )
 
-    scan_inputs = before, begins, run.ends, run.stages, rests, run.sides, spans, passes, steps
-    places, carries, gains, lags, by_start = _steps_of_blocks(
-        jax.lax.map(jax.vmap(linear), _arrange_in_blocks(scan_inputs)), len(h)
+    scan_inputs = before, begins, run.ends, run.stages, rest_and_wait, run.directions, spans, passes, steps
+    stage_unknowns, carries, gains, lags, start_factors = _steps_of_blocks(
+        jax.lax.map(jax.vmap(linearise_step), _arrange_in_blocks(scan_inputs)), len(h)
     )
-    samples = (before, by_start) if sampled else None
-    return LinearisedRun(begins, run.ends, places, run.sides, passes, clock, carries, gains, lags, samples)
+    samples = (before, start_factors) if sampled else None
+    return LinearisedRun(
+        begins, run.ends, stage_unknowns, run.directions, passes, clock, carries, gains, lags, samples
+    )
 
 
 @eqx.filter_custom_jvp
@@ -548,37 +578,37 @@ def _unknowns_at_ends(
     robot: Robot,
     conditions: Conditions,
     times: Times,
-    known: RunStates | LinearisedRun,
+    solved_run: RunStates | LinearisedRun,
 ) -> Array:
     """Unknowns at the end of every step of a solved run, with their derivatives with respect to the robot."""
-    return known.ends
+    return solved_run.ends
 
 
 @_unknowns_at_ends.def_jvp
 def _ends_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """Tangents with respect to the robot's parameters."""
     (robot, conditions, times, states), input_tangents = primals, tangents[0]
-    along = states if isinstance(states, LinearisedRun) else linearise_run(robot, conditions, times, states)
+    linearised = states if isinstance(states, LinearisedRun) else linearise_run(robot, conditions, times, states)
 
     def change(law: Callable[[Robot], Array]) -> Array:
-        value, moves = eqx.filter_jvp(law, (robot,), (input_tangents,))
-        return jnp.zeros_like(value) if moves is None else moves
+        value, tangent = eqx.filter_jvp(law, (robot,), (input_tangents,))
+        return jnp.zeros_like(value) if tangent is None else tangent
 
-    def source(_: Array, y: Array, held: Conditions, way: Array) -> Array:
-        return change(lambda r: drive_rates(r, held, y, way))
+    def source(_: Array, y: Array, conditions_of_step: Conditions, direction: Array) -> Array:
+        return change(lambda r: drive_rates(r, conditions_of_step, y, direction))
 
-    def sample(y: Array, held: Conditions, length: Array) -> Array:
-        return change(lambda r: _at_start_of_step(r, held, length, y))
+    def sample(y: Array, conditions_of_step: Conditions, length: Array) -> Array:
+        return change(lambda r: _at_start_of_step(r, conditions_of_step, length, y))
 
     begin = change(lambda r: first_conditions_and_state(r, conditions)[1])
-    return states.ends, run_response(conditions, along, source, lambda t, y, dy, _: dy, begin, sample)
+    return states.ends, run_response(conditions, linearised, source, lambda t, y, dy, _: dy, begin, sample)
 
 
 def run_response(
     conditions: Conditions,
-    along: LinearisedRun,
+    run: LinearisedRun,
     source: Callable[[Array, Array, Conditions, Array], Array],
-    seen: Callable[[Array, Array, Array, Conditions], Array],
+    observe: Callable[[Array, Array, Array, Conditions], Array],
     begin: Array,
     sample: Callable[[Array, Conditions, Array], Array] | None = None,
 ) -> Array:
@@ -586,54 +616,54 @@ def run_response(
 
     Args:
         conditions: as for `history_signals`.
-        along: the run.
-        source: (time, state, conditions, `way` of `balances.moving_signals`) → change of the rates, shape
+        run: the run.
+        source: (time, state, conditions, `direction` of `balances.moving_signals`) → change of the rates, shape
             (unknowns, ...).
-        seen: (time, state, its change, conditions) → quantity to return at the end of every step.
+        observe: (time, state, its change, conditions) → quantity to return at the end of every step.
         begin: change of the state at the first instant.
         sample: (state, conditions, length of a step) → change of the state with which the step begins.
 
     Sources within a block of steps are computed together. The sequential part is one product per step.
     """
-    steps, constant = run_steps(conditions, jnp.append(along.clock[:, 0], along.clock[-1, 2]))
+    steps, constant = run_steps(conditions, jnp.append(run.clock[:, 0], run.clock[-1, 2]))
 
-    def added(along: LinearisedRun, step: RunStep) -> Array:
+    def contribution(run: LinearisedRun, step: RunStep) -> Array:
         """Contribution of the sources of a step, at its end."""
-        conditions = step.held(constant)
-        source_terms = jax.vmap(lambda t, y, way: source(t, y, conditions, way))(
-            along.clock[1:], along.places, along.sides
+        conditions = step.all_conditions(constant)
+        source_terms = jax.vmap(lambda t, y, direction: source(t, y, conditions, direction))(
+            run.clock[1:], run.stage_unknowns, run.directions
         )
-        tangents = jnp.tensordot(along.gains, source_terms, ((0, 2), (0, 1)))
-        at_start = lambda y, held: source(along.clock[0], y, held, along.sides[0])[CURRENT]  # noqa: E731
-        of_lag = step.rates_at_start(constant, at_start, along.begins)
-        tangents = tangents + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))
-        if along.sampled is None or sample is None:
+        tangents = jnp.tensordot(run.gains, source_terms, ((0, 2), (0, 1)))
+        at_start = lambda y, step_conditions: source(run.clock[0], y, step_conditions, run.directions[0])[CURRENT]  # noqa: E731
+        of_lag = step.rates_at_start(constant, at_start, run.begins)
+        tangents = tangents + jnp.tensordot(run.lags, of_lag, ((0,), (0,)))
+        if run.sampled is None or sample is None:
             return tangents
-        before, factor = along.sampled
+        before, factor = run.sampled
         return tangents + factor @ sample(before, conditions, step.length)
 
-    def after(dy: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+    def propagate(dy: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         dy = jnp.tensordot(step[0], dy, 1) + step[1]
         return dy, dy
 
     def block(dy: Array, inputs: tuple) -> tuple[Array, Array]:
-        along, step, then = inputs
-        last, changes = jax.lax.scan(after, dy, (along.carries, jax.vmap(added)(along, step)))
-        whole = jax.vmap(lambda t, y, dy, changing: seen(t, y, dy, eqx.combine(changing, constant)))
-        return last, whole(along.clock[:, 2], along.ends, changes, then)
+        run, step, next_conditions = inputs
+        last, changes = jax.lax.scan(propagate, dy, (run.carries, jax.vmap(contribution)(run, step)))
+        observe_all = jax.vmap(lambda t, y, dy, changing: observe(t, y, dy, eqx.combine(changing, constant)))
+        return last, observe_all(run.clock[:, 2], run.ends, changes, next_conditions)
 
-    scan_inputs = along, steps, jax.tree.map(lambda x: x[1:], _split_conditions(conditions)[0])
-    return _steps_of_blocks(jax.lax.scan(block, begin, _arrange_in_blocks(scan_inputs))[1], len(along.clock))
+    scan_inputs = run, steps, jax.tree.map(lambda x: x[1:], _split_conditions(conditions)[0])
+    return _steps_of_blocks(jax.lax.scan(block, begin, _arrange_in_blocks(scan_inputs))[1], len(run.clock))
 
 
-def _arrange_in_blocks(of_steps: T) -> T:
+def _arrange_in_blocks(steps: T) -> T:
     """Data of each step, arranged in blocks of steps. The last block is padded with the last step."""
 
-    def filled(x: Array) -> Array:
+    def pad(x: Array) -> Array:
         x = jnp.concatenate([x, jnp.repeat(x[-1:], -len(x) % BLOCK, 0)])
         return x.reshape(len(x) // BLOCK, BLOCK, *x.shape[1:])
 
-    return jax.tree.map(filled, of_steps)
+    return jax.tree.map(pad, steps)
 
 
 def _steps_of_blocks(blocks: T, count: int) -> T:
@@ -641,12 +671,12 @@ def _steps_of_blocks(blocks: T, count: int) -> T:
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
 
 
-def _sensitivity_jump(robot: Robot, conditions: Conditions, y: Unknowns, sides: Pair) -> Unknowns:
+def _sensitivity_jump(robot: Robot, conditions: Conditions, y: Unknowns, directions: Pair) -> Unknowns:
     """Jump of the unknowns' sensitivity at a passage through rest, per motor speed before it: (f⁺ - f⁻) / f⁻.
 
     The moment of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3).
     """
-    before, after = jax.vmap(lambda way: drive_rates(robot, conditions, y, way))(sides)
+    before, after = jax.vmap(lambda direction: drive_rates(robot, conditions, y, direction))(directions)
     return (after - before) / before[MOTOR]
 
 
@@ -654,8 +684,8 @@ def history_signals(
     robot: Robot,
     conditions: Conditions,
     times: Times,
-    known: LinearisedRun | None = None,
-    at: Int[Array, " places"] | None = None,
+    linearised: LinearisedRun | None = None,
+    indices: Int[Array, " places"] | None = None,
 ) -> Signals:
     """Signals of one run on a time grid, from standstill or as in `Rig.begins`.
 
@@ -667,37 +697,39 @@ def history_signals(
         conditions: one run. Each field scalar, or of shape (times,): the value of an instant acts until the next one,
             and the signals of that instant use it.
         times: times from 0 on, as from `time_grid` [s]. Repeated instants are steps of no length.
-        known: the run, from `linearise_run`, if computed.
-        at: indices of the instants to return. None: all.
+        linearised: the run, from `linearise_run`, if computed.
+        indices: indices of the instants to return. None: all.
 
     A run whose equations could not be solved is not finite from there on. Shafts and a load that move as one rest if
     friction holds them. For others friction at rest is smooth: gravity makes a resting robot creep, below a tenth of
     V_s.
     """
     changing, constant = _split_conditions(conditions)
-    ys, sides = _unknowns_of_run(robot, conditions, times, known)
-    states = ys, jnp.append(sides[:, 0], sides[-1, 1]), changing
-    if at is not None:
-        states = jax.tree.map(lambda x: x[at], states)
+    ys, directions = _unknowns_of_run(robot, conditions, times, linearised)
+    states = ys, jnp.append(directions[:, 0], directions[-1, 1]), changing
+    if indices is not None:
+        states = jax.tree.map(lambda x: x[indices], states)
 
-    def seen(y: Array, way: Array, now: Conditions) -> Signals:
-        held = eqx.combine(now, constant)
-        return signals_of_instant(robot, held, sampled_unknowns(robot, held, y), way)
+    def signals_at(y: Array, direction: Array, changing_now: Conditions) -> Signals:
+        instant_conditions = eqx.combine(changing_now, constant)
+        return signals_of_instant(
+            robot, instant_conditions, sampled_unknowns(robot, instant_conditions, y), direction
+        )
 
-    return jax.vmap(seen)(*states)
+    return jax.vmap(signals_at)(*states)
 
 
 def _unknowns_of_run(
-    robot: Robot, conditions: Conditions, times: Times, known: LinearisedRun | None
+    robot: Robot, conditions: Conditions, times: Times, linearised: LinearisedRun | None
 ) -> tuple[Float[Array, "times unknowns"], Float[Array, "steps 2"]]:
-    """Unknowns at every instant, and `sides` of every step."""
+    """Unknowns at every instant, and `directions` of every step."""
     constant_robot = jax.lax.stop_gradient(robot)
-    run = solve_states(constant_robot, conditions, times) if known is None else known
+    run = solve_states(constant_robot, conditions, times) if linearised is None else linearised
     ends = _unknowns_at_ends(robot, conditions, times, run)
-    return jnp.concatenate([first_conditions_and_state(robot, conditions)[1][None], ends]), run.sides
+    return jnp.concatenate([first_conditions_and_state(robot, conditions)[1][None], ends]), run.directions
 
 
-def signals_of_instant(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
+def signals_of_instant(robot: Robot, conditions: Conditions, y: Array, direction: Array) -> Signals:
     """Signals of an instant, in static equilibrium if friction or a clamp holds shafts and load.
 
     At the instant at which a clamp stops them, the signals before it.
@@ -706,8 +738,8 @@ def signals_of_instant(robot: Robot, conditions: Conditions, y: Array, way: Arra
     signals = moving(robot, conditions, state)
     if not robot.moves_as_one or conditions.motor_speed is not None:
         return signals
-    stands = (way == HELD) & (y[MOTOR] == 0)
-    return jax.tree.map(lambda a, b: jnp.where(stands, a, b), standing_signals(robot, conditions, state), signals)
+    is_held = (direction == HELD) & (y[MOTOR] == 0)
+    return jax.tree.map(lambda a, b: jnp.where(is_held, a, b), standing_signals(robot, conditions, state), signals)
 
 
 class StepCourse(eqx.Module):
@@ -740,36 +772,49 @@ def course_between_instants(
     robot: Robot,
     conditions: Conditions,
     times: Times,
-    known: LinearisedRun | None = None,
-    at: Int[Array, " places"] | None = None,
+    linearised: LinearisedRun | None = None,
+    step_indices: Int[Array, " places"] | None = None,
 ) -> StepCourse:
     """Course of one run between its instants, for the run of `history_signals`.
 
-    Args: as for `history_signals`, and `at`: steps to return, by the index of the instant at the start of each.
+    Args: as for `history_signals`, and `step_indices`: steps to return, each by the index of its first instant.
     """
-    ys, sides = _unknowns_of_run(robot, conditions, times, known)
+    ys, directions = _unknowns_of_run(robot, conditions, times, linearised)
     steps, constant = run_steps(conditions, times)
     instants = _split_conditions(conditions)[0]
-    begun, then = (jax.tree.map(lambda x, cut=cut: x[cut], instants) for cut in (slice(-1), slice(1, None)))
-    course_inputs = ys[:-1], ys[1:], steps, begun, then, sides
-    if at is not None:
-        course_inputs = jax.tree.map(lambda x: x[at], course_inputs)
+    conditions_before, conditions_after = (
+        jax.tree.map(lambda x, cut=cut: x[cut], instants) for cut in (slice(-1), slice(1, None))
+    )
+    course_inputs = ys[:-1], ys[1:], steps, conditions_before, conditions_after, directions
+    if step_indices is not None:
+        course_inputs = jax.tree.map(lambda x: x[step_indices], course_inputs)
 
-    def one(y: Array, after: Array, step: RunStep, begun: Conditions, then: Conditions, sides: Array) -> StepCourse:
-        conditions = step.held(constant)
+    def course_of_step(
+        y: Array,
+        after: Array,
+        step: RunStep,
+        conditions_before: Conditions,
+        conditions_after: Conditions,
+        directions: Array,
+    ) -> StepCourse:
+        conditions = step.all_conditions(constant)
         y = sampled_unknowns(robot, conditions, y)
         if step.before is None:  # the imposed quantity is itself linear
-            first = signals_of_instant(robot, eqx.combine(begun, constant), y, sides[0])
+            first = signals_of_instant(robot, eqx.combine(conditions_before, constant), y, directions[0])
             return StepCourse(
-                first, first, signals_of_instant(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
+                first,
+                first,
+                signals_of_instant(robot, eqx.combine(conditions_after, constant), after, directions[1]),
+                jnp.zeros(()),
             )
-        stopped, current = _stopped_by_clamp(conditions, y), _unit_vector_of_current(y)
-        lag = _lag_of_robot(robot, constant, step, stopped)
-        states = jnp.stack([y, stopped - lag.begin * current, after - lag.end * current])
-        rows = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, signals_of_instant(robot, conditions, *at)))(
-            states, sides[np.array([0, 0, 1])]
-        )
-        first, begin, end = (jax.tree.map(lambda x, k=k: x[k], rows) for k in range(3))
+        stopped_unknowns = _stopped_by_clamp(conditions, y)
+        current_vector = _unit_vector_of_current(y)
+        lag = _lag_of_robot(robot, constant, step, stopped_unknowns)
+        states = jnp.stack([y, stopped_unknowns - lag.begin * current_vector, after - lag.end * current_vector])
+        step_signals = jax.vmap(
+            lambda *instant: jax.tree.map(jnp.asarray, signals_of_instant(robot, conditions, *instant))
+        )(states, directions[np.array([0, 0, 1])])
+        first, begin, end = (jax.tree.map(lambda x, k=k: x[k], step_signals) for k in range(3))
         return StepCourse(first, begin, end, lag.decay * step.length)
 
-    return jax.vmap(one)(*course_inputs)
+    return jax.vmap(course_of_step)(*course_inputs)

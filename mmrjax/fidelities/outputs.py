@@ -20,27 +20,27 @@ if TYPE_CHECKING:
 FURTHER = TABLE["run"]
 
 
-def output_table(shown: Iterable[Channel]) -> tuple[Quantity, ...]:
-    """Every output in the order of columns, the channels `shown` first. Each is an attribute of `Result`."""
-    return (*shown, *FURTHER)
+def output_table(channels: Iterable[Channel]) -> tuple[Quantity, ...]:
+    """Every output in the order of columns, the channels `channels` first. Each is an attribute of `Result`."""
+    return (*channels, *FURTHER)
 
 
-def output_names(shown: Iterable[Channel]) -> tuple[str, ...]:
-    """Names of all outputs, the channels `shown` first."""
-    return tuple(output.name for output in output_table(shown))
+def output_names(channels: Iterable[Channel]) -> tuple[str, ...]:
+    """Names of all outputs, the channels `channels` first."""
+    return tuple(output.name for output in output_table(channels))
 
 
 def output_columns(
-    result: Result, shown: Iterable[Channel], further: Mapping[str, Any] | None = None
+    result: Result, channels: Iterable[Channel], further: Mapping[str, Any] | None = None
 ) -> dict[str, np.ndarray]:
     """Results in the units and words of `runs.csv`.
 
     Args:
-        shown: channels, of the robot.
-        further: columns that a fidelity adds, in their units (`fidelities.base.Run.columns`).
+        channels: channels, of the robot.
+        further: columns that a fidelity adds, in their units (`fidelities.base.RunBatch.columns`).
     """
     return {
-        **{o.column: np.asarray(getattr(result, o.name)) / o.factor for o in output_table(shown)},
+        **{o.column: np.asarray(getattr(result, o.name)) / o.factor for o in output_table(channels)},
         **status_words(result.status, result.flags),
         **{name: np.asarray(values) for name, values in (further or {}).items()},
     }

@@ -1,4 +1,4 @@
-"""Robots at rest: whether friction holds them, their current at rest, and the status at the end of a run."""
+"""Robots at rest: the friction that holds them, their current at rest, and the status at the end of a run."""
 
 from __future__ import annotations
 
@@ -50,19 +50,25 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     the motors push against the load torque.
     """
     if conditions.motor_speed is not None:
-        way = jnp.asarray(conditions.motor_speed)
-        way = way if conditions.load_torque is None else jnp.where(way == 0, conditions.load_torque, way)
-        return jax.lax.stop_gradient(jnp.where(way >= 0, 1.0, -1.0))
+        reference = jnp.asarray(conditions.motor_speed)
+        reference = (
+            reference
+            if conditions.load_torque is None
+            else jnp.where(reference == 0, conditions.load_torque, reference)
+        )
+        return jax.lax.stop_gradient(jnp.where(reference >= 0, 1.0, -1.0))
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    stall = robot.motor.current_stall(voltage_at_rest(robot, conditions))
+    current = robot.motor.current_stall(voltage_at_rest(robot, conditions))
     if not conditions.voltage_follows:
-        most = robot.driver.current_limit * (1 + jnp.abs(balances.bridge_duty(robot, conditions)) * (1 / STEEPNESS))
-        stall = elementary.clip(stall, -most, most)
-    stall = robot.motor.torque_electromagnetic(stall)
-    weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
-    weight = weight if conditions.load_torque is None else weight + conditions.load_torque
-    return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
+        largest = robot.driver.current_limit * (
+            1 + jnp.abs(balances.bridge_duty(robot, conditions)) * (1 / STEEPNESS)
+        )
+        current = elementary.clip(current, -largest, largest)
+    stall = robot.motor.torque_electromagnetic(current)
+    load_torque = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
+    load_torque = load_torque if conditions.load_torque is None else load_torque + conditions.load_torque
+    return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= load_torque, 1.0, -1.0))
 
 
 def output_is_held(conditions: Conditions) -> Array:
@@ -88,20 +94,23 @@ def _source_at_rest(robot: Robot, conditions: Conditions) -> Array:
     return jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
 
 
-def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tuple[Scalar, Scalar]:
+def admitted_current(robot: Robot, conditions: Conditions, unlimited_current: Scalar) -> tuple[Scalar, Scalar]:
     """Current that limit and diode of the driver allow [A], and the voltage that blocks the rest [V].
 
     See `Driver.admitted`, with the resistance of a motor and its share of the battery's. An amplifier that imposes
     speed or current has neither limit nor diode.
     """
     if conditions.voltage_follows:
-        return wanted, jnp.zeros_like(wanted)
-    battery, duty = robot.battery, balances.bridge_duty(robot, conditions)
-    behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
-    resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
+        return unlimited_current, jnp.zeros_like(unlimited_current)
+    battery = robot.battery
+    duty = balances.bridge_duty(robot, conditions)
+    battery_resistance = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
+    resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, battery_resistance, 0.0)
     resistance, source = jax.lax.stop_gradient((resistance, _source_at_rest(robot, conditions)))
-    current, is_limited = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
-    return current, resistance * is_limited
+    current, blocked_current = robot.driver.admitted(
+        unlimited_current, conditions.polarity * duty, jnp.abs(source) / resistance
+    )
+    return current, resistance * blocked_current
 
 
 def without_diode(robot: Robot) -> Robot:
@@ -116,8 +125,8 @@ def _signals_about_to_turn(robot: Robot, conditions: Conditions, state: State, d
     """
     signals = balances.settled_signals(robot, conditions, state, direction)[0]
     limit = signals.adhesion_limit
-    carried = replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
-    return balances.gearbox(robot, robot.chassis(conditions.configuration), carried, settled=True)
+    loaded = replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
+    return balances.gearbox(robot, robot.chassis(conditions.configuration), loaded, settled=True)
 
 
 def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Signals:
@@ -134,46 +143,52 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
     """
     robot = robot.within(conditions.configuration)
     conditions = balances.with_controller_duty(robot, conditions, state)
-    chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _without_motion(state)
+    chassis = robot.chassis(conditions.configuration)
+    gear = robot.gearbox
+    still_state = _without_motion(state)
     # About to turn forward and backward: the two limits of friction.
-    ends = [balances.settled_signals(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
-    ahead, back = ends
+    limits = [balances.settled_signals(robot, conditions, still_state, direction)[0] for direction in (1.0, -1.0)]
+    forward, backward = limits
     # Least and greatest torque through the gearbox, and least and greatest friction of the track.
-    inputs = [
-        gear.torque_output(end.torque_motor - end.torque_idle, end.direction)
-        - (end.torque_load - end.torque_track_loss - chassis.radius * end.traction)
-        for end in ends
+    input_torques = [
+        gear.torque_output(limit.torque_motor - limit.torque_idle, limit.direction)
+        - (limit.torque_load - limit.torque_track_loss - chassis.radius * limit.traction)
+        for limit in limits
     ]
-    track_losses = [end.torque_track_loss for end in (back, ahead)]
-    traction = ahead.gravity
+    track_losses = [limit.torque_track_loss for limit in (backward, forward)]
+    traction = forward.gravity
     if robot.has_ground:
-        least_, most = ((inputs[k] - track_losses[1 - k]) / chassis.radius for k in range(2))
+        least_traction, most_traction = ((input_torques[k] - track_losses[1 - k]) / chassis.radius for k in range(2))
         traction = elementary.clip(
-            elementary.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit
+            elementary.clip(traction, least_traction, most_traction), -forward.adhesion_limit, forward.adhesion_limit
         )
-    carried = chassis.radius * traction
-    loads = [carried + lost for lost in track_losses]
+    traction_torque = chassis.radius * traction
+    load_torques = [traction_torque + track_loss for track_loss in track_losses]
     if conditions.held is not None:
-        loads = [jnp.where(conditions.held > 0.5, *both) for both in zip(inputs, loads, strict=True)]
-    torque = elementary.clip(0.0, jnp.maximum(loads[0], inputs[0]), jnp.minimum(loads[1], inputs[1]))
-    none = jnp.zeros_like(carried)
+        load_torques = [
+            jnp.where(conditions.held > 0.5, *both) for both in zip(input_torques, load_torques, strict=True)
+        ]
+    torque = elementary.clip(
+        0.0, jnp.maximum(load_torques[0], input_torques[0]), jnp.minimum(load_torques[1], input_torques[1])
+    )
+    zero = jnp.zeros_like(traction_torque)
     return replace(
-        ahead,
-        direction=none,
-        direction_travel=none,
-        resistance=traction - ahead.gravity,
+        forward,
+        direction=zero,
+        direction_travel=zero,
+        resistance=traction - forward.gravity,
         demand=traction,
         traction=traction,
-        torque_track_loss=torque - carried,
+        torque_track_loss=torque - traction_torque,
         torque_load=torque,
         torque_gear=torque,
         torque_output=torque,
         torque_carried=torque,
         torque_input=torque / gear.ratio,
-        torque_net=none,
-        speed_sliding=none,
-        acceleration_wheel=none,
-        acceleration=none,
+        torque_net=zero,
+        speed_sliding=zero,
+        acceleration_wheel=zero,
+        acceleration=zero,
     )
 
 
@@ -187,9 +202,9 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
     The ground grips, and motors and gravity cannot turn the shafts at the motors' current at rest, which
     flows a millisecond after the start.
     """
-    none = jnp.zeros_like(conditions.voltage)
-    memory = {effect.name: none for effect in robot.remembering}
-    rest = State(none, none, none, conditions.discharge, memory, distance=none, gap=none if robot.loose else None)
+    zero = jnp.zeros_like(conditions.voltage)
+    memory = {effect.name: zero for effect in robot.remembering}
+    rest = State(zero, zero, zero, conditions.discharge, memory, distance=zero, gap=zero if robot.loose else None)
     settled = replace(rest, current=current_at_rest(robot, conditions, rest))
     return jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0
 
@@ -198,8 +213,8 @@ def _ground_margin(forward: Signals, backward: Signals) -> Array:
     """Adhesion minus the pull of gravity that rolling resistance does not carry [-]. Negative if a robot slides
     down.
     """
-    along = -smallest_of(-backward.demand, forward.demand)
-    return (forward.adhesion_limit - along) / forward.normal
+    pull = -smallest_of(-backward.demand, forward.demand)
+    return (forward.adhesion_limit - pull) / forward.normal
 
 
 def holding_margin(robot: Robot, conditions: Conditions, state: State) -> Array:
@@ -232,33 +247,46 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
     conditions = balances.with_controller_duty(robot, conditions, state)
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
     slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
-    at_once = jnp.zeros_like(motor_speed)
+    no_wait = jnp.zeros_like(motor_speed)
     if conditions.motor_speed is not None:
-        change = jnp.asarray(0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration)
-        way = jnp.where(slow & (change == 0), 0.0, jnp.sign(jnp.where(motor_speed == 0, change, motor_speed)))
-        return way, at_once
+        acceleration = jnp.asarray(0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration)
+        direction = jnp.where(
+            slow & (acceleration == 0), 0.0, jnp.sign(jnp.where(motor_speed == 0, acceleration, motor_speed))
+        )
+        return direction, no_wait
 
-    def leaving(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
+    def leave_rest(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
         settled = replace(state, current=current_at_rest(robot, conditions, state))
-        now, then = (_signals_both_ways(robot, conditions, state_there) for state_there in (state, settled))
-        leaving_sense, later_sense = (
-            1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then)
+        signals_now, signals_settled = (
+            _signals_both_ways(robot, conditions, instant) for instant in (state, settled)
         )
-        lacks, exceeds = (
-            jnp.where(later_sense > 0, ahead.torque_net, -back.torque_net) for ahead, back in (now, then)
+        direction_now, direction_settled = (
+            1.0 * (forward.torque_net > 0) - 1.0 * (backward.torque_net < 0)
+            for forward, backward in (signals_now, signals_settled)
         )
-        winding = balances.driven_signals(robot, conditions, _without_motion(state), None)
-        rises, missing = winding.voltage_left / winding.inductance, settled.current - state.current
-        waits = (leaving_sense == 0) & (later_sense != 0) & (rises * missing > 0)
-        share = jnp.where(waits, -lacks / jnp.where(waits, exceeds - lacks, 1.0), 0.0)
-        wait = -jnp.log1p(-share) * missing / jnp.where(waits, rises, 1.0)
-        way = jnp.where(leaving_sense != 0, leaving_sense, jnp.where(later_sense != 0, later_sense, HELD))
+        torque_now, torque_settled = (
+            jnp.where(direction_settled > 0, forward.torque_net, -backward.torque_net)
+            for forward, backward in (signals_now, signals_settled)
+        )
+        driven_signals = balances.driven_signals(robot, conditions, _without_motion(state), None)
+        current_rate, missing_current = (
+            driven_signals.voltage_left / driven_signals.inductance,
+            settled.current - state.current,
+        )
+        waits = (direction_now == 0) & (direction_settled != 0) & (current_rate * missing_current > 0)
+        share = jnp.where(waits, -torque_now / jnp.where(waits, torque_settled - torque_now, 1.0), 0.0)
+        wait = -jnp.log1p(-share) * missing_current / jnp.where(waits, current_rate, 1.0)
+        direction = jnp.where(
+            direction_now != 0, direction_now, jnp.where(direction_settled != 0, direction_settled, HELD)
+        )
         stands = state.speed_motor == 0
-        return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
+        return jnp.where(stands, direction, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
-    way, wait = compute_if_needed(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
+    direction, wait = compute_if_needed(
+        slow, leave_rest, (robot, conditions, state), (jnp.sign(motor_speed), no_wait)
+    )
     is_clamped = output_is_held(conditions)
-    return jnp.where(is_clamped, HELD, way), jnp.where(is_clamped, 0.0, wait)
+    return jnp.where(is_clamped, HELD, direction), jnp.where(is_clamped, 0.0, wait)
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
@@ -267,34 +295,40 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     It slides down if gravity less rolling resistance exceeds the adhesion. It slides in place if the motors turn the
     movers faster than V_s. Up to V_s the traction of the ground increases with sliding speed.
     """
-    chassis, sense = robot.chassis(conditions.configuration), travel_direction(robot, conditions)
-    none = jnp.zeros_like(conditions.voltage)
-    still = State(none, none, none, conditions.discharge)
-    turning = sense * chassis.ground.friction.speed_static * robot.gearbox.ratio / chassis.radius
-    spun = replace(still, speed_motor=turning * jnp.ones_like(still.speed))
+    chassis = robot.chassis(conditions.configuration)
+    sense = travel_direction(robot, conditions)
+    zero = jnp.zeros_like(conditions.voltage)
+    still_state = State(zero, zero, zero, conditions.discharge)
+    motor_speed_at_grip = sense * chassis.ground.friction.speed_static * robot.gearbox.ratio / chassis.radius
+    spun_state = replace(still_state, speed_motor=motor_speed_at_grip * jnp.ones_like(still_state.speed))
     if conditions.motor_speed is not None:
-        spins = sense * conditions.motor_speed > sense * turning
+        spins = sense * conditions.motor_speed > sense * motor_speed_at_grip
     else:
-        spun = replace(spun, current=current_settled(robot, conditions, spun))
-        spins = sense * _signals_about_to_turn(robot, conditions, spun, sense).torque_net > 0
-    forward, backward = (balances.demanded_signals(robot, conditions, still, way + none) for way in (1.0, -1.0))
+        spun_state = replace(spun_state, current=current_settled(robot, conditions, spun_state))
+        spins = sense * _signals_about_to_turn(robot, conditions, spun_state, sense).torque_net > 0
+    forward, backward = (
+        balances.demanded_signals(robot, conditions, still_state, direction + zero) for direction in (1.0, -1.0)
+    )
     return (_ground_margin(forward, backward) < 0) | spins
 
 
 def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Current that settles at the motor speed of `state` [A], by the secant method on its voltage balance."""
 
-    def left(wanted: Scalar) -> Scalar:
-        current, is_limited = admitted_current(robot, conditions, wanted)
-        state_there = replace(state, current=current)
-        none = jnp.zeros_like(state.speed)
-        return balances.driven_signals(without_diode(robot), conditions, state_there, none).voltage_left - is_limited
+    def voltage_left(unlimited_current: Scalar) -> Scalar:
+        current, blocked_voltage = admitted_current(robot, conditions, unlimited_current)
+        state_at_current = replace(state, current=current)
+        direction = jnp.zeros_like(state.speed)
+        return (
+            balances.driven_signals(without_diode(robot), conditions, state_at_current, direction).voltage_left
+            - blocked_voltage
+        )
 
-    guess = robot.motor.current_stall(left(jnp.zeros_like(state.current)))
-    first, second = left(0.5 * guess), left(guess)
+    guess = robot.motor.current_stall(voltage_left(jnp.zeros_like(state.current)))
+    first, second = voltage_left(0.5 * guess), voltage_left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
-    newton_guess = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
-    return admitted_current(robot, conditions, newton_guess)[0]
+    secant_guess = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+    return admitted_current(robot, conditions, secant_guess)[0]
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
@@ -302,7 +336,7 @@ def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scala
     return current_settled(robot, conditions, _without_motion(state))
 
 
-def is_at_rest(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:
+def is_at_rest(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, speed_rest: Scalar) -> Array:
     """True if a robot counts as at rest: slower than the resolution of static friction.
 
     A robot driven by its motors travels if both shafts and robot move in the motors' direction. On a slope the creep
@@ -312,11 +346,11 @@ def is_at_rest(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar
         sense: direction of possible travel, 1 or -1.
         voltage: voltage at the motors at rest [V].
         theoretical: r_k ω_k [m/s].
-        rest: speed below which friction at rest is not resolved [m/s].
+        speed_rest: speed below which friction at rest is not resolved [m/s].
     """
     shafts, travel = sense * theoretical, sense * speed
     driven = sense * voltage > 0
-    return jnp.where(driven, jnp.minimum(shafts, travel), jnp.maximum(shafts, travel)) < rest
+    return jnp.where(driven, jnp.minimum(shafts, travel), jnp.maximum(shafts, travel)) < speed_rest
 
 
 def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: Scalar) -> Array:
@@ -330,17 +364,18 @@ def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: S
         `not_settled` if the speed changes, or if the robot gains speed with movers sliding beyond V_s. `slides` if it
         then loses speed or stands. `stalled` if it creeps. Else the status of steady travel.
     """
-    settling = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
-    status = jnp.where(settling, NOT_SETTLED, travel_status(end.speed, voltage))
-    sense, speed_still = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    still = is_at_rest(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, speed_still)
-    status = jnp.where(still & (sense * end.acceleration < STARTS), STALLED, status)
+    is_changing = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
+    status = jnp.where(is_changing, NOT_SETTLED, travel_status(end.speed, voltage))
+    sense = travel_direction(robot, conditions)
+    speed_still = robot.chassis(conditions.configuration).speed_still
+    is_still = is_at_rest(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, speed_still)
+    status = jnp.where(is_still & (sense * end.acceleration < STARTS), STALLED, status)
     gain = end.acceleration * jnp.sign(end.speed_sliding)
-    return status_with_slip(status, robot, end, gain, GAIN, still)
+    return status_with_slip(status, robot, end, gain, GAIN, is_still)
 
 
 def status_with_slip(
-    status: Array, robot: Robot, signals: Signals, gain: Scalar, least: float, stands: Array | bool
+    status: Array, robot: Robot, signals: Signals, gain: Scalar, least_gain: float, stands: Array | bool
 ) -> Array:
     """Status of a run with slip taken into account, else `status`.
 
@@ -348,8 +383,10 @@ def status_with_slip(
 
     Args:
         gain: acceleration of the robot [m/s²].
-        least: smallest that counts.
+        least_gain: smallest that counts.
         stands: True if it does not travel.
     """
-    loose = jnp.where(gain > least, NOT_SETTLED, jnp.where(jnp.asarray(gain < -least) | stands, SLIDES, status))
-    return jnp.where(movers_slip(robot, signals), loose, status)
+    slip_status = jnp.where(
+        gain > least_gain, NOT_SETTLED, jnp.where(jnp.asarray(gain < -least_gain) | stands, SLIDES, status)
+    )
+    return jnp.where(movers_slip(robot, signals), slip_status, status)

@@ -46,9 +46,10 @@ class PendingBatch:
     fidelity: Fidelity
 
     @computed_outside_trace
-    def shown(self) -> dict[str, jax.Array]:
+    def readings(self) -> dict[str, jax.Array]:
         """Readings of the robot's instruments by channel, and the status codes as `status`."""
-        outputs, names = self.fidelity.outputs, (*channels.channel_names(self.robot.channels), STATUS)
+        outputs = self.fidelity.outputs
+        names = (*channels.channel_names(self.robot.channels), STATUS)
         assert outputs is not None
         return _map_in_chunks(self.fidelity, lambda runs: outputs(self.robot, runs, names), self.conditions)
 
@@ -83,15 +84,15 @@ T = TypeVar("T")
 def _map_in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditions: Conditions) -> T:
     """Returns the values of a function of conditions of shape (runs,), in the shape of the conditions.
 
-    Large batches are split into chunks of one size, which share a compilation. The last chunk ends
-    with the last run. Small batches are padded (`Facts.filled`) by NumPy, which compiles nothing. Dispatching JAX
+    Large batches are split into chunks of one size, which share a compilation. The last chunk ends with the last run.
+    Small batches are padded (`FidelityFacts.filled`) by NumPy, which compiles nothing. Dispatching JAX
     operations leaf by leaf took twenty times as long as the equations at 262 144 runs.
     """
     size = fidelity.facts.at_once(jax.default_backend() != "cpu")
     runs = math.prod(conditions.shape)
-    filled = min(fidelity.facts.filled(runs), size)
-    if 0 < runs < filled:
-        rows = np.minimum(np.arange(filled), runs - 1)  # padding repeats the last run
+    padded_size = min(fidelity.facts.filled(runs), size)
+    if 0 < runs < padded_size:
+        rows = np.minimum(np.arange(padded_size), runs - 1)  # padding repeats the last run
         part = function(jax.device_put(jax.tree.map(lambda x: np.ravel(x)[rows], conditions)))
         return jax.device_put(
             jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), part)
@@ -144,8 +145,10 @@ def total_mass(robot: Robot, conditions: Conditions) -> jax.Array:
 
 
 @compiled
-def _unstated_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, payload: jax.Array) -> jax.Array:
-    return jnp.stack([jnp.asarray(mass) for mass in own])[configuration] + payload
+def _unstated_mass(
+    masses: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, payload: jax.Array
+) -> jax.Array:
+    return jnp.stack([jnp.asarray(mass) for mass in masses])[configuration] + payload
 
 
 #: Columns of a printed table in addition to conditions and channels.
@@ -253,13 +256,14 @@ class Results:
 
     def _compute(self, name: str) -> None:
         """Computes the program that contains a name, unless it is already computed."""
-        cache, batch = self.__dict__, self.__dict__.get("_pending")
+        cache = self.__dict__
+        batch = self.__dict__.get("_pending")
         if batch is None or name.startswith("_"):
             return
         if name == "total_mass":
             cache[name] = batch.total_mass()
         elif "result" not in cache and name in (*channel_names(batch.robot.channels), "status"):
-            columns = cache.get("_shown") or batch.shown()
+            columns = cache.get("_shown") or batch.readings()
             cache["_shown"] = {**columns, STATUS: _comparable_codes(columns[STATUS])}
             cache.update(cache["_shown"])
         elif "result" not in cache:
@@ -310,27 +314,28 @@ class Results:
 
         Over a profile the outcomes are those of the mission. Conditions that the profile states are NaN.
         """
-        conditions, nan = self.conditions, np.full(self.shape, np.nan)
+        conditions = self.conditions
+        nan = np.full(self.shape, np.nan)
 
-        def of_run(name: str, values: Any) -> np.ndarray:
+        def column_of_run(name: str, values: Any) -> np.ndarray:
             return nan if name in self.stated else np.asarray(values)
 
-        braked = "load_torque" in self.stated or conditions.load_torque is not None
-        external = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
-        found = outputs.output_columns(self.result, self.channels, self.further)
+        has_brake = "load_torque" in self.stated or conditions.load_torque is not None
+        supply_voltage = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
+        outcomes = outputs.output_columns(self.result, self.channels, self.further)
         if self.mission is not None:
-            found = {
-                name: found[name]
+            outcomes = {
+                name: outcomes[name]
                 for name in (*mission_batch.mission_columns("turned" in self.mission.total.of), *CODES)
             }
         return {
             "configuration": self.configuration,
-            "supply_voltage_V": of_run("voltage", external),
-            "total_mass_kg": of_run("payload", self.total_mass),
-            "payload_kg": of_run("payload", conditions.payload),
-            "slope_deg": of_run("slope_deg", conditions.slope_deg),
-            **({"load_torque_Nm": of_run("load_torque", conditions.load_torque)} if braked else {}),
-            **found,
+            "supply_voltage_V": column_of_run("voltage", supply_voltage),
+            "total_mass_kg": column_of_run("payload", self.total_mass),
+            "payload_kg": column_of_run("payload", conditions.payload),
+            "slope_deg": column_of_run("slope_deg", conditions.slope_deg),
+            **({"load_torque_Nm": column_of_run("load_torque", conditions.load_torque)} if has_brake else {}),
+            **outcomes,
         }
 
     def table(self, columns: Sequence[str] | None = None, rows: int = 40) -> str:
@@ -341,14 +346,18 @@ class Results:
             rows: largest number of lines.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}
-        rows_of = (
+        quantities = (
             *outputs.output_table(self.channels), *mission_batch.OUTPUTS, *mission_batch.OF_TURNS,
         )  # fmt: skip
-        column_facts = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit_shown, o.resolution) for o in rows_of}}
+        column_facts = {
+            **_CONDITIONS,
+            **_WORDS,
+            **{o.column: (o.label, o.unit_shown, o.resolution) for o in quantities},
+        }
         if columns is None and self.mission is not None:
             columns = ["configuration", *mission_batch.USUAL, "status"]
         elif columns is None:
-            shown = [
+            readings = [
                 output.column
                 for output in outputs.output_table(self.channels)
                 if output.column in _SHOWN or output.name in self.reading
@@ -359,7 +368,7 @@ class Results:
                 "slope_deg",
                 "payload_kg",
                 *(["load_torque_Nm"] if "load_torque_Nm" in content else []),
-                *shown,
+                *readings,
                 *self.further,
                 "status",
             ]
@@ -367,14 +376,14 @@ class Results:
         for name in columns:
             label, unit, digits = column_facts.get(name, (name.replace("_", " "), "", 3))
             values = content[name][:rows]
-            words = values.dtype.kind == "U"
-            body = [str(v) if words else f"{v:z.{digits}f}" for v in values]
+            is_text = values.dtype.kind == "U"
+            body = [str(v) if is_text else f"{v:z.{digits}f}" for v in values]
             column = [label, f"[{unit}]" if unit not in ("", "-") else "", *body]
             width = max(map(len, column))
-            cells.append([c.ljust(width) if words else c.rjust(width) for c in column])
+            cells.append([c.ljust(width) if is_text else c.rjust(width) for c in column])
         lines = ["  ".join(line).rstrip() for line in zip(*cells, strict=True)]
-        padding = len(content["status"]) - rows
-        return "\n".join([*lines, f"... and {padding} more"] if padding > 0 else lines)
+        omitted = len(content["status"]) - rows
+        return "\n".join([*lines, f"... and {omitted} more"] if omitted > 0 else lines)
 
     def __str__(self) -> str:
         return self.table()

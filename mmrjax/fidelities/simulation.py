@@ -96,8 +96,8 @@ def simulate(
         raise UsageError(
             "held: a clamp needs a shaft at an imposed voltage or current and model='steady'; use both, or omit held"
         )
-    braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
-    if braked and robot.has_ground:
+    has_brake = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
+    if has_brake and robot.has_ground:
         raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
     turns = conditions.turns or (profile is not None and profile.turns)
     if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
@@ -108,7 +108,8 @@ def simulate(
     if profile is not None:
         return _forward_mode_only(_simulate_missions(robot, conditions, profile, start, history))
     robot = robot.showing_turns() if conditions.turns else robot
-    fidelity, traced = fidelities.get_fidelity(model), has_tracer((robot, conditions))
+    fidelity = fidelities.get_fidelity(model)
+    traced = has_tracer((robot, conditions))
     if not traced:
         try:
             fidelity.check(robot, flatten_conditions(conditions), resolved_options)
@@ -139,8 +140,8 @@ def _forward_mode_only(results: Results) -> Results:
     """Same results with a clear error in reverse mode: a loop over adaptive steps does not support it."""
     if not has_tracer(results):
         return results
-    kind = results.model if results.mission is None else f"{results.model} over a profile"
-    guarded: Results = eqxi.nondifferentiable_backward(results, msg=f"{kind}: {FORWARD_ALONE}")
+    description = results.model if results.mission is None else f"{results.model} over a profile"
+    guarded: Results = eqxi.nondifferentiable_backward(results, msg=f"{description}: {FORWARD_ALONE}")
     return guarded
 
 
@@ -150,22 +151,22 @@ def _check_battery(robot: Robot, conditions: Conditions) -> None:
         return
     if any(np.ndim(x) for x in jax.tree.leaves(robot.battery)):  # a batch of robots
         return
-    if refused := power.cutoff_error(robot.battery):
-        raise UsageError(f"battery.voltage_cutoff: {refused}")
+    if reason := power.cutoff_error(robot.battery):
+        raise UsageError(f"battery.voltage_cutoff: {reason}")
     if remark := power.cutoff_remark(robot.battery):
         warnings.warn(f"battery.voltage_cutoff: {remark}", stacklevel=3)
 
 
 def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
     """Raises if the sides are driven independently and the robot cannot turn."""
-    freed = [name for name in OF_TURNS if getattr(conditions, name) is not None]
-    freed += ["profile"] if profile is not None and profile.turns else []
-    if not freed or has_tracer((robot, conditions.configuration)):
+    turn_inputs = [name for name in OF_TURNS if getattr(conditions, name) is not None]
+    turn_inputs += ["profile"] if profile is not None and profile.turns else []
+    if not turn_inputs or has_tracer((robot, conditions.configuration)):
         return
     if any(np.ndim(x) for x in jax.tree.leaves((robot.sides, robot.configurations))):  # a batch of robots
         return
-    if why := turn_error(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
-        raise UsageError(f"{freed[0]}: {why}")
+    if reason := turn_error(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
+        raise UsageError(f"{turn_inputs[0]}: {reason}")
 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
@@ -198,17 +199,18 @@ def _simulate_missions(
             )
     missions = mission_batch.missions_of_runs(robot, runs, profile, start, history=history)
     further = mission_batch.numbers_by_column(mission_batch.mission_numbers(robot, runs, missions))
-    course = None
+    mission_history = None
     if missions.course is not None:
-        course = History.of(robot, missions.course.time, missions.course.distance, missions.course.signals)
-    missions, further, course = reshape_runs((missions, further, course), conditions.shape)
-    names, mass = robot.configurations.names, total_mass(robot, conditions)
+        mission_history = History.of(robot, missions.course.time, missions.course.distance, missions.course.signals)
+    missions, further, mission_history = reshape_runs((missions, further, mission_history), conditions.shape)
+    names = robot.configurations.names
+    mass = total_mass(robot, conditions)
     return Results(
         conditions,
         mass,
         missions.result,
         further,
-        course,
+        mission_history,
         names,
         mission_batch.MODEL,
         missions,
@@ -238,7 +240,8 @@ def check_robot(robot: Robot) -> None:
 
 def _resolve_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions with configuration names replaced by indices, checked against the robot's configurations."""
-    names, configuration = robot.configurations.names, conditions.configuration
+    names = robot.configurations.names
+    configuration = conditions.configuration
     if isinstance(configuration, NamedConfigurations):
         try:
             return replace(conditions, configuration=configuration.among(names))
@@ -272,18 +275,18 @@ def _check_conditions(conditions: Conditions) -> None:
     # An unstated duty is 1, and under a transformation a tracer; neither counts as stated.
     if has_tracer(conditions.duty) or (np.asarray(conditions.duty) == 1).all():
         stated_names.remove("duty")
-    if why := sides_contradiction(stated_names):
-        raise UsageError(why)
-    ends: dict[int, tuple[float, float]] = {}  # by array: several fields may share one
+    if reason := sides_contradiction(stated_names):
+        raise UsageError(reason)
+    extremes: dict[int, tuple[float, float]] = {}  # by array: several fields may share one
     for field in dataclasses.fields(conditions):
         value = getattr(conditions, field.name)
         if field.name == "configuration" or value is None or has_tracer(value) or not value.size:
             continue
         condition = CONDITIONS[field.name]
         (low, high), unit = condition.range, condition.unit_shown
-        if id(value) not in ends:
-            ends[id(value)] = _smallest_and_largest(value)
-        least, most = ends[id(value)]
+        if id(value) not in extremes:
+            extremes[id(value)] = _smallest_and_largest(value)
+        least, most = extremes[id(value)]
         if not low <= least <= most <= high and (wrong := _first_outside(value, low, high)):
             raise UsageError(
                 f"{field.name}{wrong[0]}: got {wrong[1]:.6g}; expected {low:g} to {high:g} {unit}".rstrip()
@@ -291,11 +294,11 @@ def _check_conditions(conditions: Conditions) -> None:
     declared_mass, payload = conditions.total_mass, conditions.payload
     if declared_mass is None or has_tracer((declared_mass, payload)):
         return
-    own_mass = np.asarray(declared_mass) - np.asarray(payload)
-    wrong = _first_outside(own_mass, np.nextafter(0.0, 1.0), math.inf)
+    mass_without_payload = np.asarray(declared_mass) - np.asarray(payload)
+    wrong = _first_outside(mass_without_payload, np.nextafter(0.0, 1.0), math.inf)
     if wrong is not None:
-        place = np.unravel_index(int(np.argmax(~(own_mass > 0))), own_mass.shape)
-        mass, load = float(np.asarray(declared_mass)[place]), float(np.asarray(payload)[place])
+        index = np.unravel_index(int(np.argmax(~(mass_without_payload > 0))), mass_without_payload.shape)
+        mass, load = float(np.asarray(declared_mass)[index]), float(np.asarray(payload)[index])
         raise UsageError(f"total_mass{wrong[0]}: got {mass:g} kg; expected more than the payload, {load:g} kg")
 
 
@@ -312,8 +315,8 @@ def _first_outside(value: Any, low: float, high: float) -> tuple[str, float] | N
     numbers = np.asarray(value)
     if not numbers.shape and low <= numbers <= high and math.isfinite(numbers):
         return None
-    bad = ~((numbers >= low) & (numbers <= high) & np.isfinite(numbers))
-    if not bad.any():
+    is_outside = ~((numbers >= low) & (numbers <= high) & np.isfinite(numbers))
+    if not is_outside.any():
         return None
-    place = np.unravel_index(int(np.argmax(bad)), bad.shape)
-    return ("[" + ", ".join(str(int(k)) for k in place) + "]" if place else ""), float(numbers[place])
+    index = np.unravel_index(int(np.argmax(is_outside)), is_outside.shape)
+    return ("[" + ", ".join(str(int(k)) for k in index) + "]" if index else ""), float(numbers[index])

@@ -66,25 +66,29 @@ def _signals_and_residuals(
     """
     speed, scaled_current, third = unknowns
     conditions, speed_motor = _clamped_conditions(conditions, third)
-    current, is_limited = rest.admitted_current(robot, conditions, _CURRENT * scaled_current)
+    current, blocked_voltage = rest.admitted_current(robot, conditions, _CURRENT * scaled_current)
     state = State(current, _SPEED_MOTOR * speed_motor, _SPEED * speed, conditions.discharge)
-    signals, creep = _balanced(rest.without_diode(robot), conditions, state, sense)
+    signals, creep_speed = _balanced(rest.without_diode(robot), conditions, state, sense)
     # Moving with balanced torques, or at rest with too little torque: speed >= 0 and torque <= 0 in the direction of
     # travel, and one of them is 0.
-    lacking, moving = -sense * signals.torque_net / _TORQUE, sense * third
-    torque = sense * jnp.where(moving < lacking, moving, lacking)
-    slip, voltage = signals.speed_sliding - creep, (signals.voltage_left - is_limited) / _VOLTAGE
+    torque_deficit = -sense * signals.torque_net / _TORQUE
+    scaled_motion = sense * third
+    torque_error = sense * jnp.where(scaled_motion < torque_deficit, scaled_motion, torque_deficit)
+    slip_error, voltage_error = (
+        signals.speed_sliding - creep_speed,
+        (signals.voltage_left - blocked_voltage) / _VOLTAGE,
+    )
     if conditions.motor_speed is not None:  # the torque determines the current; the motor speed is given
         speed_error = speed_motor - conditions.motor_speed / _SPEED_MOTOR
         return (
             state,
             signals,
-            (slip, (signals.torque_net / _TORQUE), speed_error),
+            (slip_error, (signals.torque_net / _TORQUE), speed_error),
         )
     if not robot.driver.returns_current:  # a diode takes the rest of the voltage
-        settled = signals.voltage_back + signals.voltage_drop
-        signals = replace(signals, voltage=settled, voltage_left=jnp.zeros_like(settled))
-    return state, signals, (slip, voltage, torque)
+        settled_voltage = signals.voltage_back + signals.voltage_drop
+        signals = replace(signals, voltage=settled_voltage, voltage_left=jnp.zeros_like(settled_voltage))
+    return state, signals, (slip_error, voltage_error, torque_error)
 
 
 def _clamped_conditions(conditions: Conditions, third: Scalar) -> tuple[Conditions, Scalar]:
@@ -93,24 +97,24 @@ def _clamped_conditions(conditions: Conditions, third: Scalar) -> tuple[Conditio
         return conditions, third
     is_clamped = rest.output_is_held(conditions)
     load = 0.0 if conditions.load_torque is None else conditions.load_torque
-    carried = replace(conditions, load_torque=jnp.where(is_clamped, _TORQUE * third, load))
-    return carried, jnp.where(is_clamped, 0.0, third)
+    clamped = replace(conditions, load_torque=jnp.where(is_clamped, _TORQUE * third, load))
+    return clamped, jnp.where(is_clamped, 0.0, third)
 
 
 @compiled
-def _residuals(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
-    conditions, sense = own
+def _residuals(unknowns: Vector, robot: Robot, run_inputs: tuple[Conditions, Array]) -> Vector:
+    conditions, sense = run_inputs
     robot = robot.within(conditions.configuration)
-    return _signals_and_residuals(robot, _conditions_are_sound(robot, conditions)[1], unknowns, sense)[2]
+    return _signals_and_residuals(robot, _sound_conditions(robot, conditions)[1], unknowns, sense)[2]
 
 
-def _residuals_without_limit(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
+def _residuals_without_limit(unknowns: Vector, robot: Robot, run_inputs: tuple[Conditions, Array]) -> Vector:
     """`_residuals` in most runs: linear, without the driver's limit and diode."""
-    return _residuals(unknowns, replace(robot, driver=robot.driver.unlimited()), own)
+    return _residuals(unknowns, replace(robot, driver=robot.driver.unlimited()), run_inputs)
 
 
-def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
-    """Returns whether a run's conditions are finite and its mass positive, and the conditions, set to 1 if not.
+def _sound_conditions(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
+    """True if a run's conditions are finite and its mass is positive, and the conditions, set to 1 if not.
 
     A NaN in the residual would reach the derivatives of the whole batch, as 0 * NaN.
     """
@@ -125,11 +129,11 @@ def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, 
 
 
 def _initial_guess(robot: Robot, conditions: Conditions) -> Vector:
-    nominal = rest.voltage_at_rest(robot, conditions)
-    speed = nominal * (0.9 / robot.motor.torque_constant)
+    voltage = rest.voltage_at_rest(robot, conditions)
+    speed = voltage * (0.9 / robot.motor.torque_constant)
     if conditions.motor_speed is not None:
         speed = conditions.motor_speed
-    current = nominal * (0.05 / robot.motor.resistance)
+    current = voltage * (0.05 / robot.motor.resistance)
     if not conditions.voltage_follows:  # below the limit, from which Newton's method reaches each part of the curve
         current = clip(current, -0.5 * robot.driver.current_limit, 0.5 * robot.driver.current_limit)
     return (
@@ -140,15 +144,15 @@ def _initial_guess(robot: Robot, conditions: Conditions) -> Vector:
 
 
 def _search_arguments(robot: Robot, conditions: Conditions) -> tuple[Callable, Vector, Robot, Any, float]:
-    """Residuals, first guess, robot, a run's own inputs and tolerance, as `newton.root` takes them."""
+    """Residuals, first guess, robot, inputs of the run and tolerance: the arguments of `newton.root`."""
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
-    sound = _conditions_are_sound(robot, conditions)[1]
+    sound = _sound_conditions(robot, conditions)[1]
     start = jax.lax.stop_gradient(_initial_guess(robot, sound))
     return _residuals, start, robot, (conditions, rest.travel_direction(robot, sound)), tolerance
 
 
 def _solve_balances(robot: Robot, conditions: Conditions) -> tuple[Vector, Array]:
-    """The root of the balances, and whether the search converged. Derivatives are implicit."""
+    """The root of the balances, and True if the search converged. Derivatives are implicit."""
     return root(*_search_arguments(robot, conditions), None if robot.effects else _residuals_without_limit)
 
 
@@ -165,8 +169,10 @@ def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     if conditions.turns:
         return _turning_signals(robot, conditions)
     unknowns, _ = _solve_balances(robot, conditions)
-    _, sound = _conditions_are_sound(robot, conditions)
-    return _signals_and_residuals(robot, sound, unknowns, rest.travel_direction(robot, sound))[1]
+    _, sound_conditions = _sound_conditions(robot, conditions)
+    return _signals_and_residuals(robot, sound_conditions, unknowns, rest.travel_direction(robot, sound_conditions))[
+        1
+    ]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -192,8 +198,8 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
         return circling.steady(robot, conditions)
     point, sound = operating_point(robot, conditions)
     # Friction at rest holds a standing robot; the contact law alone would give it a creep.
-    crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).speed_still
-    parked = (point.status == STALLED) & ((jnp.abs(point.theoretical_speed) < 1e-9) | crept)
+    has_crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).speed_still
+    parked = (point.status == STALLED) & ((jnp.abs(point.theoretical_speed) < 1e-9) | has_crept)
     speed = jnp.where(parked, 0.0, point.speed)
     reading = {**point.reading, "speed": speed}
     # The ground of a standing robot does not carry more than its limit either, although the shafts creep.
@@ -208,8 +214,8 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
         power_lift=jnp.where(parked, 0.0, point.power_lift),
     )
     settles = (point.status == CONVERGED) | (point.status == STALLED)
-    not_forward = (point.status == REVERSES) | (point.status == ROLLS_BACK)
-    return withhold_numbers(point, settles | not_forward, sound)
+    travels_backward = (point.status == REVERSES) | (point.status == ROLLS_BACK)
+    return withhold_numbers(point, settles | travels_backward, sound)
 
 
 @compiled
@@ -221,7 +227,7 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     respect to μ_s.
 
     Returns:
-        The result, and whether robot and conditions are sound (see `_conditions_are_sound`).
+        The result, and True if robot and conditions are sound (see `_sound_conditions`).
     """
     if conditions.turns:
         return circling.operating_point(robot, conditions)
@@ -231,27 +237,32 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
 
 def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     robot = robot.within(conditions.configuration)
-    return rest.slides_in_place(robot, _conditions_are_sound(robot, conditions)[1])
+    return rest.slides_in_place(robot, _sound_conditions(robot, conditions)[1])
 
 
 def operating_state(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
-    """Every signal of `operating_point`, its status, and whether robot and conditions are sound."""
+    """Every signal of `operating_point`, its status, and True if robot and conditions are sound."""
     unknowns, solved = _solve_balances(robot, conditions)
     return _state_at_unknowns(robot, conditions, unknowns, solved)[:3]
 
 
 def _state_at_unknowns(
-    robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array, stands: bool = True, rests: bool = True
+    robot: Robot,
+    conditions: Conditions,
+    unknowns: Vector,
+    solved: Array,
+    tests_sliding: bool = True,
+    static_at_rest: bool = True,
 ) -> tuple[Signals, Array, Array, Vector]:
     """`operating_state` at given unknowns, and the residuals of the balances there.
 
     Args:
-        stands: True to test whether a run beyond the limit of adhesion slides or stands. False: it `slides`.
-        rests: True for static equilibrium in the signals of a robot at rest. False: they are those of the search.
+        tests_sliding: True to distinguish sliding from standing beyond the limit of adhesion. False: it `slides`.
+        static_at_rest: True for static equilibrium in the signals of a robot at rest. False: signals of the search.
     """
-    detached = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
+    constant_inputs = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
     robot = robot.within(conditions.configuration)
-    sound, conditions = _conditions_are_sound(robot, conditions)
+    sound, conditions = _sound_conditions(robot, conditions)
     sense = rest.travel_direction(robot, conditions)
     state, signals, residual = _signals_and_residuals(robot, conditions, unknowns, sense)
     speed_still = robot.chassis(conditions.configuration).speed_still
@@ -263,18 +274,18 @@ def _state_at_unknowns(
     if robot.has_ground:
         exceeds_adhesion = jnp.abs(signals.demand) > signals.adhesion_limit
         is_sliding = (
-            compute_if_needed(exceeds_adhesion, _slides_in_place, detached, jnp.zeros_like(exceeds_adhesion))
-            if stands
+            compute_if_needed(exceeds_adhesion, _slides_in_place, constant_inputs, jnp.zeros_like(exceeds_adhesion))
+            if tests_sliding
             else exceeds_adhesion
         )
         status = jnp.where(exceeds_adhesion, jnp.where(is_sliding, SLIDES, STALLED), status)
-    if rests and conditions.motor_speed is None:
+    if static_at_rest and conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
         stands_still &= ~rest.output_is_held(conditions) | (
             sense * unknowns[2] <= 1e-9
         )  # friction leaves the clamp nothing
         static = rest.standing_signals(robot, _clamped_conditions(conditions, 0.0)[0], state)
-        signals = jax.tree.map(lambda still, moving: jnp.where(stands_still, still, moving), static, signals)
+        signals = jax.tree.map(lambda standing, moving: jnp.where(stands_still, standing, moving), static, signals)
     status = jnp.where(rest.output_is_held(conditions), CONVERGED, status)
     status = jnp.where(solved, status, FAILED)
     status = jnp.where(robot.battery.emptied(conditions.battery, conditions.discharge), BATTERY_EMPTY, status)
@@ -296,13 +307,13 @@ def _map_over_points(function: Callable[..., Any], *arguments: Any) -> Any:
     if points <= BLOCK or block == points or jax.default_backend() != "cpu":
         return batched(*arguments)
 
-    def of_block(rows: list[Array | None]) -> Any:
+    def map_block(rows: list[Array | None]) -> Any:
         block_leaves = [x if row is None else row for x, row in zip(leaves, rows, strict=True)]
         return batched(*jax.tree.unflatten(tree, block_leaves))
 
     # Reverse mode computes a block again: the stored values of all blocks would fill the memory.
     blocks = jax.lax.map(
-        jax.checkpoint(of_block), [jnp.reshape(x, (-1, block)) if jnp.ndim(x) else None for x in leaves]
+        jax.checkpoint(map_block), [jnp.reshape(x, (-1, block)) if jnp.ndim(x) else None for x in leaves]
     )
     return jax.tree.map(lambda x: jnp.reshape(x, points), blocks)
 
@@ -337,11 +348,11 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
     if unknown := [name for name in names if name not in allowed]:
         raise KeyError(f"no output {unknown[0]}; there are {', '.join(allowed)}")
 
-    def one(robot: Robot, conditions: Conditions) -> dict[str, Array]:
-        answer = steady(robot, conditions)
-        return {name: jnp.asarray(getattr(answer, name)) for name in names}
+    def outputs_of_point(robot: Robot, conditions: Conditions) -> dict[str, Array]:
+        result = steady(robot, conditions)
+        return {name: jnp.asarray(getattr(result, name)) for name in names}
 
-    return _map_over_points(one, robot, conditions)
+    return _map_over_points(outputs_of_point, robot, conditions)
 
 
 def _settled_results(robot: Robot, conditions: Conditions) -> Result:
@@ -356,11 +367,13 @@ def _solve_run(robot: Robot, conditions: Conditions) -> tuple[Unknowns, Bool[Arr
 
 
 def _results_at_unknowns(
-    robot: Robot, conditions: Conditions, unknowns: Unknowns, found: Bool[Array, ""], rests: bool = True
+    robot: Robot, conditions: Conditions, unknowns: Unknowns, solved: Bool[Array, ""], static_at_rest: bool = True
 ) -> tuple[Result, Signals, Unknowns]:
     if conditions.turns:
-        return circling.turn_results(robot, conditions, unknowns, found)
-    signals, status, _, residual = _state_at_unknowns(robot, conditions, tuple(unknowns), found, False, rests)
+        return circling.turn_results(robot, conditions, unknowns, solved)
+    signals, status, _, residual = _state_at_unknowns(
+        robot, conditions, tuple(unknowns), solved, False, static_at_rest
+    )
     return result_of_signals(robot.within(conditions.configuration), signals, status), signals, jnp.stack(residual)
 
 
@@ -373,19 +386,21 @@ IMPLICIT = ImplicitSolution(_solve_run, _results_at_unknowns)
 SIZES = (16, 24, 32, 48, 64, 96, 128, 192, 256)
 
 
-def results_of_rows(robot: Robot, conditions: Conditions, rests: bool = True) -> tuple[Result, Signals]:
+def results_of_rows(robot: Robot, conditions: Conditions, static_at_rest: bool = True) -> tuple[Result, Signals]:
     """Results and signals of the rows of a table, with each half as a separate program.
 
     Args:
-        rests: True for static equilibrium in the signals of rows at rest. False: a smaller program.
+        static_at_rest: True for static equilibrium in the signals of rows at rest. False: a smaller program.
     """
-    robot, rows, parts = params.without_weak_types(robot), conditions.shape[0], []
+    robot = params.without_weak_types(robot)
+    rows = conditions.shape[0]
+    parts = []
     # Straight travel is computed quickly, so that every table can share one program.
     size = next((s for s in SIZES if s >= rows and conditions.turns), SIZES[-1])
     for part in np.arange(rows + -rows % size).reshape(-1, size):
         index = np.where(part < rows, part, 0)
         padded = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), conditions)  # noqa: B023
-        parts.append(_shown_rows(robot, padded, *_solved_rows(robot, padded), rests))
+        parts.append(_results_of_solved_rows(robot, padded, *_solved_rows(robot, padded), static_at_rest))
     return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)[:rows]), *parts)
 
 
@@ -395,11 +410,11 @@ def _solved_rows(robot: Robot, conditions: Conditions) -> tuple[Float[Array, "ro
 
 
 @functools.partial(compiled, options=SELDOM)
-def _shown_rows(
-    robot: Robot, conditions: Conditions, unknowns: Array, found: Array, rests: bool
+def _results_of_solved_rows(
+    robot: Robot, conditions: Conditions, unknowns: Array, solved: Array, static_at_rest: bool
 ) -> tuple[Result, Signals]:
-    show = functools.partial(_results_at_unknowns, robot, rests=rests)
-    return jax.vmap(lambda *row: show(*row)[:2])(conditions, unknowns, found)
+    results_at = functools.partial(_results_at_unknowns, robot, static_at_rest=static_at_rest)
+    return jax.vmap(lambda *row: results_at(*row)[:2])(conditions, unknowns, solved)
 
 
 def _run_batch(

@@ -112,24 +112,25 @@ def _initial_unknowns(robot: Robot, conditions: Conditions, rolling: bool) -> Un
 def _unknowns_after_step(robot: Robot, conditions: Conditions, y: Unknowns, dt: Scalar) -> Unknowns:
     """Unknowns of `drive` after a step. A robot that has stopped is held if friction can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
-    last = len(y) - robot.loose
+    controller_end = len(y) - robot.loose
     keeps_changing = np.isin(
-        np.arange(len(y)), (drive.CURRENT, _DISCHARGE, *range(last - len(robot.controller_states), last))
+        np.arange(len(y)),
+        (drive.CURRENT, _DISCHARGE, *range(controller_end - len(robot.controller_states), controller_end)),
     )
     y = drive.sampled_unknowns(robot, conditions, y)
-    is_standing = holds(robot, balances.with_controller_duty(robot, conditions, drive.state_of_unknowns(robot, y)))
-    stands = is_standing & jnp.all(jnp.where(speeds, y, 0.0) == 0)
-    moves = jnp.where(stands, jnp.asarray(keeps_changing, y.dtype), 1.0)
+    can_hold = holds(robot, balances.with_controller_duty(robot, conditions, drive.state_of_unknowns(robot, y)))
+    is_at_rest = can_hold & jnp.all(jnp.where(speeds, y, 0.0) == 0)
+    rate_factor = jnp.where(is_at_rest, jnp.asarray(keeps_changing, y.dtype), 1.0)
 
     def rate(y: Array) -> tuple[Array, Array]:
-        return drive.drive_rates(robot, conditions, y) * moves, y[:0]
+        return drive.drive_rates(robot, conditions, y) * rate_factor, y[:0]
 
-    def part(y: Array, share: Array) -> tuple[Array, None]:
+    def advance(y: Array, share: Array) -> tuple[Array, None]:
         return rosenbrock_stages(rate, y, y[:0], share * dt, looped=True)[0], None
 
-    after = jax.lax.scan(part, y, jnp.asarray(PARTS, y.dtype))[0]
-    rests = is_standing & jnp.all(jnp.where(speeds, y * after, 0.0) <= 0)
-    return jnp.where(rests & speeds, 0.0, after)
+    after = jax.lax.scan(advance, y, jnp.asarray(PARTS, y.dtype))[0]
+    comes_to_rest = can_hold & jnp.all(jnp.where(speeds, y * after, 0.0) <= 0)
+    return jnp.where(comes_to_rest & speeds, 0.0, after)
 
 
 def _commanded_conditions(robot: Robot, command: Command, conditions: Conditions | None) -> Conditions:
@@ -180,8 +181,8 @@ def _unknowns_of_state(robot: Robot, state: State) -> Unknowns:
         raise UsageError(f"state: got {type(state).__name__}; expected one from mmrjax.initial_state or a step")
     remembered = {effect.name for effect in robot.remembering}
     controlled = {name for name in ("integral", "command", "pending", "clock") if getattr(state, name) is not None}
-    others = (state.gap is not None) != bool(robot.loose) or controlled != {*robot.controller_states}
-    if remembered != state.memory.keys() or others:
+    differs = (state.gap is not None) != bool(robot.loose) or controlled != {*robot.controller_states}
+    if remembered != state.memory.keys() or differs:
         raise UsageError("state: got one of another robot; expected one from mmrjax.initial_state(robot)")
     if shape := next((np.shape(x) for x in jax.tree.leaves(state) if np.shape(x)), ()):
         raise UsageError(f"state: got numbers of shape {shape}; expected one state, or jax.vmap over several")

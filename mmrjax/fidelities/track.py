@@ -55,7 +55,7 @@ class TrackTrajectory(eqx.Module):
 
     Attributes:
         time: end of each sample interval [s], shape (samples,).
-        q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5). For a robot free to
+        q, v: coordinates and velocities at those times (see `side_contacts`), shape (samples, 5). For a robot free to
             turn those of `both_sides`, shape (samples, 10).
         signals: means over each interval. Each field has shape (samples,). For a robot free to turn they and the
             following have a last axis of left and right side: (samples, 2).
@@ -83,32 +83,36 @@ def _period_averages(
 ) -> tuple[Any, Scalar, Array, Changes]:
     """Means of signals (or `Travel`) and guides' load, number of periods, and change and size of three signals."""
     # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step. Each adds up to
-    # one with its neighbour a pitch on: the mean of an orbit that repeats with the pitch is exact
-    # and varies smoothly with the place at which the run ends.
-    pitch, end = run.path.pitch, travelled[-1]
+    # one with the weight one pitch further. The mean of an orbit that repeats with the pitch is therefore exact, and
+    # it varies smoothly with the position at which the run ends.
+    pitch = run.path.pitch
+    end = travelled[-1]
     middle = (travelled[1:] + travelled[:-1]) / 2
     window_begin = _window_begin(time)
-    plain = (time[1:] > window_begin).astype(time.dtype)
+    window_weights = (time[1:] > window_begin).astype(time.dtype)
     window_start = travelled[jnp.searchsorted(time, window_begin)]
     periods = jnp.floor(jax.lax.stop_gradient((end - window_start) / pitch))
     periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
 
-    def mean(begin: Array, until: Scalar, otherwise: Array) -> tuple[Any, Array]:
+    def means_over(begin: Array, until: Scalar, otherwise: Array) -> tuple[Any, Array]:
         rise = contact.cubic_step(middle, end - begin * pitch, 0.0, end - (begin - 1) * pitch, 1.0)
         fall = contact.cubic_step(middle, end - (until + 1) * pitch, 1.0, end - until * pitch, 0.0)
         weight = jnp.where(periods > 0, rise * fall, otherwise)
         return jax.tree.map(lambda x: jnp.sum(weight * x) / jnp.sum(weight), sums)
 
-    half = jnp.floor(periods / 2) + 1
-    early = plain * (jnp.cumsum(plain) <= jnp.sum(plain) / 2)
-    means, guided = mean(periods, 0.0, plain)
-    halves = mean(periods, periods - half, early)[0], mean(half, 0.0, plain - early)[0]
+    half_periods = jnp.floor(periods / 2) + 1
+    first_half = window_weights * (jnp.cumsum(window_weights) <= jnp.sum(window_weights) / 2)
+    means, guide_load = means_over(periods, 0.0, window_weights)
+    halves = (
+        means_over(periods, periods - half_periods, first_half)[0],
+        means_over(half_periods, 0.0, window_weights - first_half)[0],
+    )
     earlier, later, period_signals = (signals_of(x) for x in (*halves, means))
     changes = [
-        (jnp.abs(getattr(later, f) - getattr(earlier, f)), jnp.abs(getattr(period_signals, f)))
-        for f in ("total_current", "speed_motor", "speed")
+        (jnp.abs(getattr(later, field) - getattr(earlier, field)), jnp.abs(getattr(period_signals, field)))
+        for field in ("total_current", "speed_motor", "speed")
     ]
-    return means, guided, periods.astype(int), changes
+    return means, guide_load, periods.astype(int), changes
 
 
 def track(
@@ -152,46 +156,50 @@ def _moving_system_module(conditions: Conditions) -> ModuleType:
 
 
 def _initial_motion(run: HalfRobotSystem, rolling: bool) -> HalfRobotState:
-    kind = _moving_system_module(run.conditions)
-    start: HalfRobotState = kind.roll(run) if rolling else kind.stand(run)
+    module = _moving_system_module(run.conditions)
+    start: HalfRobotState = module.roll(run) if rolling else module.stand(run)
     return start
 
 
 def _advance_and_record(
     run: HalfRobotSystem, start: HalfRobotState, steps: int, samples: int
 ) -> tuple[HalfRobotState, SampleRecord]:
-    kind = _moving_system_module(run.conditions)
+    module = _moving_system_module(run.conditions)
 
-    def small(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, tuple[Any, Array]]:
-        after, record, guided = kind.advance(run, motion)
-        return after, (record, guided)
+    def advance_step(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, tuple[Any, Array]]:
+        after, record, guide_load = module.advance(run, motion)
+        return after, (record, guide_load)
 
     @jax.checkpoint  # reverse mode keeps one motion per sample and recomputes the steps in between
-    def interval(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, SampleRecord]:
-        after, records = jax.lax.scan(small, motion, None, length=steps)
-        record, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
-        return after, (after, record, guided, kind.loads(run, *kind.instant(run, after)[1:]))
+    def advance_sample(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, SampleRecord]:
+        after, records = jax.lax.scan(advance_step, motion, None, length=steps)
+        record, guide_load = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
+        return after, (after, record, guide_load, module.loads(run, *module.instant(run, after)[1:]))
 
-    return jax.lax.scan(interval, start, None, length=samples)
+    return jax.lax.scan(advance_sample, start, None, length=samples)
 
 
 def _assemble_trajectory(
     run: HalfRobotSystem, start: HalfRobotState, end: HalfRobotState, record: SampleRecord, sample: float
 ) -> TrackTrajectory:
-    kind, (motions, passed, guided, reactions) = _moving_system_module(run.conditions), record
+    module = _moving_system_module(run.conditions)
+    motions, sample_means, guide_loads, reactions = record
     time = sample * jnp.arange(len(motions.q) + 1)
-    travelled = run.path.radius * jnp.concatenate([start.q[None, kind.SHAFTS], motions.q[:, kind.SHAFTS]])
-    averages = kind.steady_averages(functools.partial(_period_averages, run, time), travelled, passed, guided)
-    status = kind.status(run, averages, end)
+    travelled = run.path.radius * jnp.concatenate([start.q[None, module.SHAFTS], motions.q[:, module.SHAFTS]])
+    averages = module.steady_averages(
+        functools.partial(_period_averages, run, time), travelled, sample_means, guide_loads
+    )
+    status = module.status(run, averages, end)
     valid = (status != FAILED) & (status != TIPS)
     window = time[1:] > _window_begin(time)
-    signals, answer = signals_of(passed), kind.result_of(run, averages, status)
-    load = jnp.sum(jnp.reshape(signals.normal, (len(motions.q), -1)), axis=-1)
-    aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))
-    jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
-    flags = answer.flags | flag_mask({"jumps": jumps})
-    answer = withhold_numbers(replace(answer, flags=flags), valid, status != FAILED)
-    return TrackTrajectory(time[1:], motions.q, motions.v, signals, reactions, averages, answer)
+    signals = signals_of(sample_means)
+    result = module.result_of(run, averages, status)
+    normal_load = jnp.sum(jnp.reshape(signals.normal, (len(motions.q), -1)), axis=-1)
+    is_aloft = window & (normal_load < ALOFT * jnp.sum(averages.signals.normal))
+    jumps = jnp.sum(is_aloft) > JUMPS * jnp.sum(window)
+    flags = result.flags | flag_mask({"jumps": jumps})
+    result = withhold_numbers(replace(result, flags=flags), valid, status != FAILED)
+    return TrackTrajectory(time[1:], motions.q, motions.v, signals, reactions, averages, result)
 
 
 def check_track_runs(
@@ -200,8 +208,8 @@ def check_track_runs(
     """Raises if the track model cannot compute some run of a batch.
 
     Raises:
-        ValueError: `sample` is not a whole number of steps or `duration` of samples, a lever reaches below the
-            ground, the step is above the largest stable one, which the message states. Also a load without ground, an
+        ValueError: `sample` is not a whole number of steps or `duration` of samples, or a lever reaches below the
+            ground. The step is above the largest stable one, which the message states. Also a load without ground, an
             imposed motor speed, movers without inertia, parts with more mass or inertia than the robot.
     """
     if not robot.has_ground:
@@ -326,8 +334,8 @@ def _run_histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> RunBatch:
     runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
-    away, reactions = _moving_system_module(conditions).distance_and_reactions(runs.q, runs.reactions)
-    history = History.of(robot, runs.time, away, runs.signals, reactions)
+    distance, reactions = _moving_system_module(conditions).distance_and_reactions(runs.q, runs.reactions)
+    history = History.of(robot, runs.time, distance, runs.signals, reactions)
     return RunBatch(runs.result, {"guide_share": runs.steady.guide_share}, history)
 
 

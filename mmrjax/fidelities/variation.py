@@ -90,13 +90,15 @@ class Variation(eqx.Module):
 
     def _axis(self, name: str, parameter: params.Parameter | None) -> Axis:
         if parameter is not None:
-            spec, value = parameter.spec, float(parameter.value)
+            spec = parameter.spec
+            value = float(parameter.value)
             return Axis(name, spec.unit, spec.meaning, spec.bounds, value, spec.prior_sd(value), spec)
         if name == "configuration":
             return Axis(name, "", CONDITIONS[name], (0.0, len(self.robot.configurations) - 1.0), 0.0)
-        condition, usual = quantities.CONDITIONS[name], getattr(Conditions(), name)
-        usual_value = None if usual is None else float(usual)
-        return Axis(name, condition.unit_shown, condition.label, condition.range, usual_value)
+        condition = quantities.CONDITIONS[name]
+        default = getattr(Conditions(), name)
+        default_value = None if default is None else float(default)
+        return Axis(name, condition.unit_shown, condition.label, condition.range, default_value)
 
     @property
     def varies_robot(self) -> bool:
@@ -138,7 +140,7 @@ def evaluate_points(
 
     Args:
         fidelity: one of `fidelities.NAMES`.
-        options: all of its options, from `Facts.resolved`.
+        options: all of its options, from `FidelityFacts.resolved`.
         values: one row per point, in the order of `variation.names`.
         conditions: the other conditions, of shape () or (points,), names of configurations resolved.
         outputs: names of `outputs.output_table`, or of columns that the fidelity adds, also `flags`. Over a profile
@@ -167,11 +169,11 @@ def _evaluate(
 ) -> dict[str, Array]:
     (points, _) = values.shape
     conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), conditions)
-    outputs_of = variation.robot.channels
+    channels = variation.robot.channels
     if profile is None and fidelity == "steady":
         from mmrjax.fidelities.steady import steady_outputs
 
-        _known(names, table_of_outputs.output_names(outputs_of))
+        _check_names(names, table_of_outputs.output_names(channels))
         robot, point_conditions = variation.at(values, conditions)
         point_conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), point_conditions)
         return steady_outputs(robot, point_conditions, (*names, STATUS))
@@ -184,26 +186,28 @@ def _evaluate(
         return fidelities.get_fidelity(fidelity).run(robot, conditions, options)
 
     if not variation.varies_robot:
-        return pick_outputs(simulate(*variation.at(values, conditions)), outputs_of, names)
+        return pick_outputs(simulate(*variation.at(values, conditions)), channels, names)
 
-    def one(values: Array, conditions: Conditions) -> RunBatch:
+    def evaluate_point(values: Array, conditions: Conditions) -> RunBatch:
         robot, point = variation.at(values, conditions)
         run = simulate(robot, jax.tree.map(lambda x: x[None], point))
         return jax.tree.map(lambda x: x[0], run)
 
-    return pick_outputs(jax.vmap(one)(values, conditions), outputs_of, names)
+    return pick_outputs(jax.vmap(evaluate_point)(values, conditions), channels, names)
 
 
-def pick_outputs(run: RunBatch, shown: tuple[Channel, ...], names: Names) -> dict[str, Array]:
+def pick_outputs(run: RunBatch, channels: tuple[Channel, ...], names: Names) -> dict[str, Array]:
     """Outputs of a batch by name, as from `evaluate_points`, of a rig with these channels."""
-    rows = table_of_outputs.output_names(shown)
-    _known(names, (*rows, *run.columns))
-    columns = {n: getattr(run.result, n) if n in rows else run.columns[n] for n in names if n != FLAGS}
+    allowed = table_of_outputs.output_names(channels)
+    _check_names(names, (*allowed, *run.columns))
+    columns = {
+        name: getattr(run.result, name) if name in allowed else run.columns[name] for name in names if name != FLAGS
+    }
     further = {FLAGS: run.result.flags} if FLAGS in names else {}
     return {**columns, **further, STATUS: run.result.status}
 
 
-def _known(names: Names, known: Names) -> None:
+def _check_names(names: Names, allowed: Names) -> None:
     for name in names:
-        if name not in known and name != FLAGS:
-            raise UsageError(f"outputs: got {name}; {allowed_words(name, (*known, FLAGS), 3)}")
+        if name not in allowed and name != FLAGS:
+            raise UsageError(f"outputs: got {name}; {allowed_words(name, (*allowed, FLAGS), 3)}")
