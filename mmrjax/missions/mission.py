@@ -52,14 +52,14 @@ class Totals(eqx.Module):
         of: integrals by name, as in the law's `TOTALS`. `drawn` and `returned` are energy of the source, the others
             are losses.
         stored: increase of the kinetic energy [J].
-        given: net energy from the source [J]: for a battery from its charge at begin and end, for a supply by
+        supplied: net energy from the source [J]: for a battery from its charge at begin and end, for a supply by
             integration.
     """
 
     time: Array
     of: dict[str, Array]
     stored: Array
-    given: Array
+    supplied: Array
 
     @property
     def energy(self) -> Scalar:
@@ -72,7 +72,7 @@ class Totals(eqx.Module):
 
         The energy of a battery is computed from its charge, so this error also includes errors of the charge.
         """
-        return self.given - sum(self.of[name] for name in energy.SINKS) - self.stored
+        return self.supplied - sum(self.of[name] for name in energy.SINKS) - self.stored
 
 
 class Start(eqx.Module):
@@ -153,16 +153,17 @@ class Mission(eqx.Module):
 
 def initial_unknowns(law: MotionLaw, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
     """Unknowns at the start [SI], with the heading of the conditions, uphill by default."""
-    ambient, heading = robot.motor.temperature_ambient, conditions.heading_deg
+    ambient = robot.motor.temperature_ambient
+    heading = conditions.heading_deg
     winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
-    shafts = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
+    motor_speed = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
     y = jnp.zeros_like(law.units(robot))
-    for place, value in (
-        (law.CURRENT, start.current), (law.MOTOR, shafts), (law.WINDING, winding), (law.HOUSING, housing),
+    for index, value in (
+        (law.CURRENT, start.current), (law.MOTOR, motor_speed), (law.WINDING, winding), (law.HOUSING, housing),
         (law.GROUND, start.speed), (law.HEADING, 0.0 if heading is None else jnp.radians(heading)),
         (law.DISCHARGE, conditions.discharge),
     ):  # fmt: skip
-        y = y.at[place].set(value)
+        y = y.at[index].set(value)
     return y
 
 
@@ -171,28 +172,29 @@ def _segment_status(
     robot: Robot,
     otherwise: Conditions,
     segment: Profile,
-    found: Any,
-    asked: SegmentInputs,
+    instant: Any,
+    inputs: SegmentInputs,
     stands: Array,
 ) -> tuple[Array, Array]:
     """Status at the end of a segment, and True if the robot has missed the demanded speed."""
-    mode, signals = segment.mode[0], balances.signals_of(found)
+    mode = segment.mode[0]
+    signals = balances.signals_of(instant)
     driven = jnp.max(jnp.abs(signals.duty * signals.voltage_source))
-    status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
-    slow = [jnp.max(jnp.abs(x)) < 1.0 for x in (signals.direction, signals.direction_travel)]
-    rests = stands | (slow[0] & slow[1])
+    status = jnp.where(stands, STALLED, law.status(robot, inputs.conditions, instant))
+    is_slow = [jnp.max(jnp.abs(x)) < 1.0 for x in (signals.direction, signals.direction_travel)]
+    is_at_rest = stands | (is_slow[0] & is_slow[1])
     wants_motion = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
     status = jnp.where(~wants_motion & (status == STALLED), CONVERGED, status)  # it stands as demanded
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
-    per_speed = robot.gearbox.ratio / robot.chassis(otherwise.configuration).radius
-    demanded = law.demanded(robot, otherwise, segment)
+    motor_angle_per_travel = robot.gearbox.ratio / robot.chassis(otherwise.configuration).radius
+    demanded_speed = law.demanded(robot, otherwise, segment)
     # A ramp that ends in a stop is measured by its first value.
-    largest = jnp.max(jnp.abs(demanded if segment.linear else demanded[:1])) * jnp.where(
-        mode == SPEED, per_speed, 1.0
+    largest_speed = jnp.max(jnp.abs(demanded_speed if segment.linear else demanded_speed[:1])) * jnp.where(
+        mode == SPEED, motor_angle_per_travel, 1.0
     )
-    largest_error = jnp.max(jnp.abs(asked.error))
-    missed = controlled & (largest_error > MISSED * jnp.maximum(largest, 10.0))
-    status = jnp.where(controlled & (rests | (status == STALLED)) & ~missed, CONVERGED, status)
+    largest_error = jnp.max(jnp.abs(inputs.error))
+    missed = controlled & (largest_error > MISSED * jnp.maximum(largest_speed, 10.0))
+    status = jnp.where(controlled & (is_at_rest | (status == STALLED)) & ~missed, CONVERGED, status)
     return status, missed
 
 
@@ -225,35 +227,39 @@ def mission(
         values and times of the profile, through stops and reversals. At a limit that begins to act they are
         one-sided.
     """
-    begin = Start() if start is None else start
+    initial = Start() if start is None else start
     # free to turn if the profile or the conditions drive the sides differently or state a heading
     law = mission_turning if profile.turns or conditions.turns else mission_straight
     no_peaks = jnp.full(len(law.PEAKS), -jnp.inf, jnp.result_type(conditions.voltage, profile.time))
 
     def run_segment(carry: IntegrationState, k: Array) -> tuple[IntegrationState, _SegmentEnd]:
         segment = profile.row(k)
-        fresh = carry._replace(peaks=no_peaks, flags=jnp.asarray(0))
-        beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
-        c = integrate_segment(law, robot, conditions, segment, fresh, tolerance)
-        signals, _, _, demand = law.instant(robot, conditions, segment, c.y, c.stands)
-        status, missed = _segment_status(law, robot, conditions, segment, signals, demand, c.stands)
+        carry_in = carry._replace(peaks=no_peaks, flags=jnp.asarray(0))
+        signals_before = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
+        c = integrate_segment(law, robot, conditions, segment, carry_in, tolerance)
+        signals, _, _, inputs = law.instant(robot, conditions, segment, c.y, c.stands)
+        status, missed = _segment_status(law, robot, conditions, segment, signals, inputs, c.stands)
         status = jnp.where(c.ended, _early_end_status(c), status)
-        slips = law.exceeded(robot, signals)["slips"] & ~c.stands
-        flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
-        rise = law.stored(robot, signals) - law.stored(robot, beginning)
+        is_slipping = law.exceeded(robot, signals)["slips"] & ~c.stands
+        flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": is_slipping})
+        stored_rise = law.stored(robot, signals) - law.stored(robot, signals_before)
         drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
         energy_before, energy_after = (robot.battery.energy(_charge_taken(law, x.y)) for x in (carry, c))
         energy_supplied = jnp.where(conditions.battery > 0.5, energy_after - energy_before, drawn - returned)
-        ran = ~carry.ended
-        time, rise, energy_supplied = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, energy_supplied))
+        is_run = ~carry.ended
+        time, stored_rise, energy_supplied = (
+            jnp.where(is_run, x, 0.0) for x in (c.y[law.CLOCK], stored_rise, energy_supplied)
+        )
         segment_end = _SegmentEnd(
-            time, jnp.where(ran, c.q, 0.0), rise, energy_supplied, c.peaks, status, flags, signals, c.kept
+            time, jnp.where(is_run, c.q, 0.0), stored_rise, energy_supplied, c.peaks, status, flags, signals, c.kept
         )
         carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | segment_end.flags)
         return carry, segment_end
 
     order = jnp.tile(jnp.arange(profile.segment_count), profile.cycles)
-    c, segment_ends = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, no_peaks, keep), order)
+    c, segment_ends = jax.lax.scan(
+        run_segment, _initial_carry(law, robot, conditions, initial, no_peaks, keep), order
+    )
     return _assemble_mission(law, robot, conditions, profile, c, segment_ends)
 
 
@@ -265,11 +271,11 @@ class _SegmentEnd(NamedTuple):
     time: Array
     q: Array
     rise: Array
-    given: Array
+    supplied: Array
     peaks: Array
     status: Array
     flags: Array
-    found: Any
+    instant: Any
     kept: Array
 
 
@@ -282,7 +288,9 @@ def _initial_carry(
     law: MotionLaw, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int
 ) -> IntegrationState:
     """State at the start of a mission, with space for `keep` recorded steps."""
-    dtype, zero, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
+    dtype = peaks.dtype
+    zero = jnp.asarray(0)
+    false = jnp.asarray(False)
     y0 = initial_unknowns(law, robot, conditions, start).astype(dtype) / law.units(robot).astype(dtype)
     q0 = jnp.zeros(len(law.TOTALS), dtype)
     buffer = None
@@ -291,7 +299,7 @@ def _initial_carry(
         buffer = (blank * y0, blank * q0, jnp.zeros(keep, bool), jnp.full(keep, -1))
     return IntegrationState(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(start.speed == 0.0), ended=false,
-        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=peaks,
+        below=false, time_below=jnp.zeros((), dtype), cut_off=false, peaks=peaks,
         flags=zero, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=zero, rejected=zero, failed=false,
         kept=zero, buffer=buffer, slope=jnp.zeros_like(y0),
     )  # fmt: skip
@@ -303,17 +311,18 @@ def _assemble_mission(
     """Mission from its last state `c` and the ends of its segments, shape (cycles · segments, ...)."""
     shape = (profile.cycles, profile.segment_count)
     totals = {n: ends.q[:, i].reshape(shape) for i, n in enumerate(law.TOTALS)}
-    by_segment = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
-    total, status = jax.tree.map(jnp.sum, by_segment), ends.status
-    bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
-    first_bad = jnp.argmax(bad)
-    outcome = jnp.where(jnp.any(bad), status[first_bad], CONVERGED)
+    by_segment = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.supplied.reshape(shape))
+    total = jax.tree.map(jnp.sum, by_segment)
+    status = ends.status
+    is_failure = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
+    first_failure = jnp.argmax(is_failure)
+    outcome = jnp.where(jnp.any(is_failure), status[first_failure], CONVERGED)
     outcome = jnp.where(c.ended, _early_end_status(c), outcome)
-    end = jax.tree.map(lambda x: x[-1], ends.found)
-    answer = withhold_numbers(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
-    answer = replace(answer, flags=c.flags)
+    end = jax.tree.map(lambda x: x[-1], ends.instant)
+    result = withhold_numbers(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
+    result = replace(result, flags=c.flags)
 
-    def named(x: Array) -> dict[str, Array]:
+    def peaks_by_name(x: Array) -> dict[str, Array]:
         signs = {"cell_low": -1.0}
         return {name: signs.get(name, 1.0) * x[..., i] for i, name in enumerate(law.PEAKS)}
 
@@ -322,8 +331,9 @@ def _assemble_mission(
         course = _recorded_course(law, robot, conditions, profile, c, by_segment, ends.kept)
     winding, housing = _winding_and_housing_temperatures(law, c.y)
     return Mission(
-        total=total, segments=by_segment, peaks=named(c.peaks), segment_peaks=named(ends.peaks.reshape(*shape, -1)),
-        status=status.reshape(shape), flags=ends.flags.reshape(shape), result=answer,
+        total=total, segments=by_segment, peaks=peaks_by_name(c.peaks),
+        segment_peaks=peaks_by_name(ends.peaks.reshape(*shape, -1)),
+        status=status.reshape(shape), flags=ends.flags.reshape(shape), result=result,
         temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=_charge_taken(law, c.y),
         steps=c.accepted + c.rejected, rejected=c.rejected,
         course=course,
@@ -342,40 +352,40 @@ def _recorded_course(
     conditions: Conditions,
     profile: Profile,
     c: IntegrationState,
-    each: Totals,
+    segments: Totals,
     kept: Array,
 ) -> MissionCourse:
     assert c.buffer is not None
-    ys, qs, stood, marks = c.buffer
+    ys, qs, stands_at, marks = c.buffer
     index = jnp.arange(len(ys))
     # Segment of each recorded step: the first one with a larger step count.
     segment = jnp.minimum(jnp.searchsorted(kept, index, side="right"), len(kept) - 1)
     is_recorded = index < kept[-1]
-    begin_times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
+    begin_times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(segments.time.ravel())])[segment]
     so_far = {
-        name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[segment] + qs[:, i]
+        name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(segments.of[name].ravel())])[segment] + qs[:, i]
         for i, name in enumerate(law.TOTALS)
     }
 
-    def signals(y: Array, stands: Array, k: Array) -> Signals:
+    def signals(y: Array, is_standing: Array, k: Array) -> Signals:
         return balances.signals_of(
-            law.instant(robot, conditions, profile.row(k % profile.segment_count), y, stands)[0]
+            law.instant(robot, conditions, profile.row(k % profile.segment_count), y, is_standing)[0]
         )
 
-    course_signals = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
+    course_signals = law.at_places(jax.vmap(signals)(ys, stands_at, segment), so_far)
     winding, housing = _winding_and_housing_temperatures(law, ys)
 
-    def shown(x: Array) -> Array:
+    def mask_unrecorded(x: Array) -> Array:
         return jnp.where(is_recorded.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
 
     return MissionCourse(
-        time=shown(begin_times + ys[:, law.CLOCK]),
+        time=mask_unrecorded(begin_times + ys[:, law.CLOCK]),
         segment=jnp.where(is_recorded, segment, -1),
         event=jnp.where(is_recorded, marks, -1),
-        distance=shown(so_far["distance"]),
-        path=shown(so_far["path"]),
-        energy=shown(so_far["drawn"] - so_far["returned"]),
-        temperature_winding=shown(winding),
-        temperature_housing=shown(housing),
-        signals=jax.tree.map(shown, course_signals),
+        distance=mask_unrecorded(so_far["distance"]),
+        path=mask_unrecorded(so_far["path"]),
+        energy=mask_unrecorded(so_far["drawn"] - so_far["returned"]),
+        temperature_winding=mask_unrecorded(winding),
+        temperature_housing=mask_unrecorded(housing),
+        signals=jax.tree.map(mask_unrecorded, course_signals),
     )

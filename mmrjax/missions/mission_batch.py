@@ -50,54 +50,55 @@ def _safe_ratio(part: Scalar, whole: Scalar) -> Array:
     return jnp.where(positive, part / jnp.where(positive, whole, 1.0), jnp.nan)
 
 
-def _root(x: Scalar) -> Array:
+def _safe_root(x: Scalar) -> Array:
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0 * x)
 
 
-def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
+def mission_totals(totals: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
     """Numbers [SI], by name, from the totals and peaks of missions or segments, any shape.
 
     NaN for a segment that was not reached.
     """
-    by_segment, ran = found.of, found.time > 0
-    converted_energy = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in SINKS)
-    is_standing = by_segment["path"] <= 1e-6  # m
+    integrals = totals.of
+    is_run = totals.time > 0
+    converted_energy = integrals["drawn"] + integrals["returned"] + sum(jnp.abs(integrals[name]) for name in SINKS)
+    is_standing = integrals["path"] <= 1e-6  # m
     numbers = {
-        "duration": found.time,
-        "distance": by_segment["path"],
-        "displacement": by_segment["distance"],
-        "energy": found.energy,
+        "duration": totals.time,
+        "distance": integrals["path"],
+        "displacement": integrals["distance"],
+        "energy": totals.energy,
         "energy_per_metre": jnp.where(
-            is_standing, jnp.nan, _safe_ratio(found.energy, jnp.where(is_standing, 1.0, by_segment["path"]))
+            is_standing, jnp.nan, _safe_ratio(totals.energy, jnp.where(is_standing, 1.0, integrals["path"]))
         ),
-        "energy_drawn": by_segment["drawn"],
-        "energy_returned": by_segment["returned"],
-        "rms_current": _root(_safe_ratio(by_segment["current_squared"], found.time)),
+        "energy_drawn": integrals["drawn"],
+        "energy_returned": integrals["returned"],
+        "rms_current": _safe_root(_safe_ratio(integrals["current_squared"], totals.time)),
         "peak_current": peaks["current"],
-        "rms_torque": _root(_safe_ratio(by_segment["torque_squared"], found.time)),
+        "rms_torque": _safe_root(_safe_ratio(integrals["torque_squared"], totals.time)),
         "peak_torque": peaks["torque"],
         "peak_speed": peaks["speed"],
         "peak_motor_speed": peaks["motor_speed"],
         "winding_peak": peaks["temperature"],
         "cell_low": jnp.where(jnp.isfinite(peaks["cell_low"]), peaks["cell_low"], jnp.nan),
-        **{f"energy_to_{name}": by_segment[name] for name in SINKS},
-        "energy_stored": found.stored,
-        "unaccounted_share": _safe_ratio(found.unaccounted, converted_energy),
+        **{f"energy_to_{name}": integrals[name] for name in SINKS},
+        "energy_stored": totals.stored,
+        "unaccounted_share": _safe_ratio(totals.unaccounted, converted_energy),
     }
-    if "turned" in by_segment:
-        numbers |= {name: by_segment[name] for name in ("turned", "place_x", "place_y")} | {
+    if "turned" in integrals:
+        numbers |= {name: integrals[name] for name in ("turned", "place_x", "place_y")} | {
             "peak_yaw_rate": peaks["yaw_rate"]
         }
         for side in SIDES:
             numbers |= {
-                f"rms_current_{side}": _root(_safe_ratio(by_segment[f"current_squared_{side}"], found.time)),
+                f"rms_current_{side}": _safe_root(_safe_ratio(integrals[f"current_squared_{side}"], totals.time)),
                 f"peak_current_{side}": peaks[f"current_{side}"],
                 f"winding_peak_{side}": peaks[f"temperature_{side}"],
             }
-    return {name: jnp.where(ran, value, jnp.nan) for name, value in numbers.items()}
+    return {name: jnp.where(is_run, value, jnp.nan) for name, value in numbers.items()}
 
 
-def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, Array]:
+def mission_numbers(robot: Robot, conditions: Conditions, completed: Mission) -> dict[str, Array]:
     """Numbers of missions [SI], by name as in `OUTPUTS`, any shape. NaN if a number does not apply.
 
     State of charge, endurance and range refer to the on-board battery. Endurance is the time from the charge at the
@@ -105,20 +106,21 @@ def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dic
     exact if the battery becomes empty during the mission. They neglect that a demanded speed takes more current as
     the voltage falls.
     """
-    on_battery, capacity = conditions.battery > 0.5, robot.battery.capacity
-    charge_used = found.discharge - conditions.discharge
-    time, path = found.total.time, found.total.of["path"]
-    is_empty = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
-    times = jnp.where(
+    on_battery = conditions.battery > 0.5
+    capacity = robot.battery.capacity
+    charge_used = completed.discharge - conditions.discharge
+    time, path = completed.total.time, completed.total.of["path"]
+    is_empty = (completed.result.status == BATTERY_EMPTY) | (completed.result.status == CUT_OFF)
+    missions_per_charge = jnp.where(
         is_empty, 1.0, _safe_ratio(capacity - conditions.discharge, charge_used)
     )  # number of missions per charge
     return {
-        **mission_totals(found.total, found.peaks),
-        "state_of_charge": jnp.where(on_battery, 1 - found.discharge / capacity, jnp.nan),
-        "winding_end": jnp.asarray(found.temperature_winding),
-        "housing_end": jnp.asarray(found.temperature_housing),
-        "endurance": jnp.where(on_battery, times * time, jnp.nan),
-        "range": jnp.where(on_battery, times * path, jnp.nan),
+        **mission_totals(completed.total, completed.peaks),
+        "state_of_charge": jnp.where(on_battery, 1 - completed.discharge / capacity, jnp.nan),
+        "winding_end": jnp.asarray(completed.temperature_winding),
+        "housing_end": jnp.asarray(completed.temperature_housing),
+        "endurance": jnp.where(on_battery, missions_per_charge * time, jnp.nan),
+        "range": jnp.where(on_battery, missions_per_charge * path, jnp.nan),
     }
 
 
@@ -128,19 +130,24 @@ def cell_below_cutoff(robot: Robot, conditions: Conditions, profile: Profile, st
 
     Not traceable. The motor current is `start.current`, or 0 if no start is given.
     """
-    battery, first_row = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
-    other = battery.current_other if first_row.current_other is None else first_row.current_other
+    battery = robot.battery
+    first_row = jax.tree.map(lambda x: x[..., 0], profile)
+    other_current = battery.current_other if first_row.current_other is None else first_row.current_other
     duty = conditions.duty if first_row.duty is None else first_row.duty
-    motors = robot.sides * (Start() if start is None else start).current * duty
-    cell = battery.voltage_no_load(conditions.discharge) - (motors + other) * battery.resistance
-    is_below = (conditions.battery > 0.5) & (cell < battery.voltage_cutoff)
-    return np.asarray(jnp.where(is_below, cell, jnp.nan))
+    motors_current = robot.sides * (Start() if start is None else start).current * duty
+    cell_voltage = (
+        battery.voltage_no_load(conditions.discharge) - (motors_current + other_current) * battery.resistance
+    )
+    is_below = (conditions.battery > 0.5) & (cell_voltage < battery.voltage_cutoff)
+    return np.asarray(jnp.where(is_below, cell_voltage, jnp.nan))
 
 
-def numbers_by_column(found: Mapping[str, Any]) -> dict[str, Any]:
+def numbers_by_column(numbers: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers [SI] by column of tables, in the columns' units."""
     return {
-        output.column: found[output.name] / output.factor for output in (*OUTPUTS, *OF_TURNS) if output.name in found
+        output.column: numbers[output.name] / output.factor
+        for output in (*OUTPUTS, *OF_TURNS)
+        if output.name in numbers
     }
 
 
@@ -172,16 +179,17 @@ def simulate_in_parts(
     longer mission ends there.
     """
     (runs,) = conditions.shape
-    keep, first = _step_capacity(profile), 0
+    capacity = _step_capacity(profile)
+    first = 0
     while first < runs:
-        size = max(1, min(runs, MOST_KEPT // keep))
+        size = max(1, min(runs, MOST_KEPT // capacity))
         rows = np.minimum(np.arange(first, first + size), runs - 1)  # padding repeats the last run
-        some = jax.tree.map(lambda x, rows=rows: jnp.asarray(np.asarray(x)[rows]), conditions)
-        followed = jax.tree.map(lambda x, rows=rows: x[rows] if x.ndim == 2 else x, profile)
-        part = jax.device_get(simulate_batch(robot, some, followed, start, keep))
+        part_conditions = jax.tree.map(lambda x, rows=rows: jnp.asarray(np.asarray(x)[rows]), conditions)
+        part_profile = jax.tree.map(lambda x, rows=rows: x[rows] if x.ndim == 2 else x, profile)
+        part = jax.device_get(simulate_batch(robot, part_conditions, part_profile, start, capacity))
         steps = int(np.max(part.steps - part.rejected))
-        if steps > keep and keep < MOST_KEPT:
-            keep = min(MOST_KEPT, _next_power(steps))
+        if steps > capacity and capacity < MOST_KEPT:
+            capacity = min(MOST_KEPT, _next_power(steps))
             continue
         yield jax.tree.map(lambda x, count=runs - first: x[:count], part)
         first += size

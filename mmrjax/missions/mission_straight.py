@@ -22,8 +22,8 @@ from mmrjax.numerics import rosenbrock
 from mmrjax.numerics.elementary import clip
 from mmrjax.numerics.rosenbrock import Unknowns
 
-#: Units of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the
-#: controller and time in the segment, which scale them to the order of one. The memories of effects follow.
+#: Units that scale the unknowns to the order of one: current, motor speed, speed, discharge, temperatures of winding
+#: and housing, integral of the controller, time in the segment. The memories of effects follow.
 UNITS = (10.0, 1000.0, 1.0, 100.0, 50.0, 50.0, 10.0, 1.0)
 CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len(UNITS))
 
@@ -56,11 +56,11 @@ def state_of(robot: Robot, y: Unknowns, stands: Array) -> State:
     return State(x[CURRENT], motor, speed, x[DISCHARGE], memory, x[WINDING])
 
 
-def with_consumers(robot: Robot, asked: Profile) -> Robot:
+def with_consumers(robot: Robot, row: Profile) -> Robot:
     """Robot with the current of its other consumers at an instant."""
-    if asked.current_other is None:
+    if row.current_other is None:
         return robot
-    battery = replace(robot.battery, current_other=asked.current_other)
+    battery = replace(robot.battery, current_other=row.current_other)
     return replace(robot, battery=battery)
 
 
@@ -86,27 +86,29 @@ def controlled_duty(
         The duty [-], the rate of the controller's integral, and the error of the demand [rad/s]. For a ground speed,
         in terms of the motor speed that it needs.
     """
-    per_speed = robot.gearbox.ratio / robot.chassis(conditions.configuration).radius
+    motor_angle_per_travel = robot.gearbox.ratio / robot.chassis(conditions.configuration).radius
     on_ground = mode == SPEED
-    demanded = demand * jnp.where(on_ground, per_speed, 1.0)
-    error = demanded - jnp.where(on_ground, state.speed * per_speed, state.speed_motor)
+    demanded_motor_speed = demand * jnp.where(on_ground, motor_angle_per_travel, 1.0)
+    error = demanded_motor_speed - jnp.where(on_ground, state.speed * motor_angle_per_travel, state.speed_motor)
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
     voltage_source = source_voltage(robot, conditions, state.discharge)
-    voltage = robot.driver.demand(error, integral, demanded, robot.motor.torque_constant)
+    voltage = robot.driver.demand(error, integral, demanded_motor_speed, robot.motor.torque_constant)
     duty_wanted = voltage / jnp.maximum(voltage_source, 1e-3)
-    limited = robot.driver.duty_limited(clip(duty_wanted, -1.0, 1.0), state.current)
+    limited_duty = robot.driver.duty_limited(clip(duty_wanted, -1.0, 1.0), state.current)
     # Anti-windup: the part of the demand beyond the limits is taken off the integral.
-    excess = (duty_wanted - limited) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
+    excess = (duty_wanted - limited_duty) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
     duty = clip(jnp.where(controlled, conditions.polarity * duty_wanted, conditions.duty), -1.0, 1.0)
     return duty, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0)
 
 
-def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
+def inputs_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
     """Inputs of the robot at an instant."""
-    demand = segment.at(y[CLOCK])
-    robot, conditions = with_consumers(robot, demand), demand.conditions(otherwise)
-    state, integral = state_of(robot, y, stands), y[INTEGRAL] * UNITS[INTEGRAL]
-    duty, rate, error = controlled_duty(robot, demand.mode, demand.demand, conditions, state, integral)
+    row = segment.at(y[CLOCK])
+    robot = with_consumers(robot, row)
+    conditions = row.conditions(otherwise)
+    state = state_of(robot, y, stands)
+    integral = y[INTEGRAL] * UNITS[INTEGRAL]
+    duty, rate, error = controlled_duty(robot, row.mode, row.demand, conditions, state, integral)
     return SegmentInputs(robot, replace(conditions, duty=duty), rate, error)
 
 
@@ -115,74 +117,77 @@ def instant(
     robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[Signals, Array, Array, SegmentInputs]:
     """Signals of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
-    demand = asked_at(robot, otherwise, segment, y, stands)
+    inputs = inputs_at(robot, otherwise, segment, y, stands)
     state = state_of(robot, y, stands)
-    signals = balances.moving_signals(demand.robot, demand.conditions, state)
+    signals = balances.moving_signals(inputs.robot, inputs.conditions, state)
     winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
-    copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
-    copper = copper * robot.driver.ripple(signals.duty)
-    heating = robot.heating(copper, winding, housing)
-    moves = jnp.where(stands, 0.0, 1.0)
+    winding_loss = robot.motor.voltage_winding(signals.current, winding) * signals.current
+    winding_loss = winding_loss * robot.driver.ripple(signals.duty)
+    heating = robot.heating(winding_loss, winding, housing)
+    motion_factor = jnp.where(stands, 0.0, 1.0)
     rates = [
         signals.voltage_left / signals.inductance,
-        moves * signals.acceleration_wheel * robot.gearbox.ratio,
-        moves * signals.acceleration,
-        balances.charge_drawn(demand.robot, demand.conditions, signals.total_current),
+        motion_factor * signals.acceleration_wheel * robot.gearbox.ratio,
+        motion_factor * signals.acceleration,
+        balances.charge_drawn(inputs.robot, inputs.conditions, signals.total_current),
         *heating,
-        demand.integral_rate,
+        inputs.integral_rate,
         1.0,
         *(effect.rate(robot, signals) for effect in robot.remembering),
     ]
-    power = energy.source_power(demand.robot, demand.conditions, signals)
-    current, torque = robot.sides * signals.current, signals.torque_gear
-    goes = energy.sink_powers(demand.robot, demand.conditions, signals)
+    source_power = energy.source_power(inputs.robot, inputs.conditions, signals)
+    current = robot.sides * signals.current
+    torque = signals.torque_gear
+    sinks = energy.sink_powers(inputs.robot, inputs.conditions, signals)
     totals = [
-        signals.speed, jnp.abs(signals.speed), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0), current**2,
-        torque**2, *goes.values(),
+        signals.speed, jnp.abs(signals.speed), jnp.maximum(source_power, 0.0), jnp.maximum(-source_power, 0.0),
+        current**2, torque**2, *sinks.values(),
     ]  # fmt: skip
     dtype = y.dtype
     return (
         signals,
         jnp.stack([jnp.asarray(r, dtype) for r in rates]) / units(robot).astype(dtype),
         jnp.stack([jnp.asarray(x, dtype) for x in totals]),
-        demand,
+        inputs,
     )
 
 
-def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+def slowness(inputs: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     """Slowness of the shafts and of the sliding contacts [-]: 1 - |v| / limit.
 
     The limit is the speed that resolves friction. Slowness is 1 at rest, and negative above the limit.
     """
-    load, state = asked.robot.chassis(asked.conditions.configuration), state_of(asked.robot, y, stands)
-    rolling = load.radius * state.speed_motor / asked.robot.gearbox.ratio
-    return 1 - jnp.abs(rolling) / load.speed_still, 1 - jnp.abs(rolling - state.speed) / load.speed_grip
+    load = inputs.robot.chassis(inputs.conditions.configuration)
+    state = state_of(inputs.robot, y, stands)
+    rolling_speed = load.radius * state.speed_motor / inputs.robot.gearbox.ratio
+    return 1 - jnp.abs(rolling_speed) / load.speed_still, 1 - jnp.abs(rolling_speed - state.speed) / load.speed_grip
 
 
-def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+def supply_current_and_charge(inputs: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     """Current that the motors take from the source [A], and the charge taken [C]."""
-    robot, state = asked.robot, state_of(asked.robot, y, stands)
-    duty = robot.driver.duty_limited(balances.bridge_duty(robot, asked.conditions), state.current)
-    motors = robot.sides * state.current * robot.driver.share_drawn(duty)
-    return motors, state.discharge
+    robot = inputs.robot
+    state = state_of(inputs.robot, y, stands)
+    duty = robot.driver.duty_limited(balances.bridge_duty(robot, inputs.conditions), state.current)
+    current = robot.sides * state.current * robot.driver.share_drawn(duty)
+    return current, state.discharge
 
 
-def stored(robot: Robot, found: Signals) -> Scalar:
+def stored(robot: Robot, signals: Signals) -> Scalar:
     """Kinetic energy [J]."""
-    return energy.stored_energy(robot, found)
+    return energy.stored_energy(robot, signals)
 
 
-def peaks(robot: Robot, found: Signals) -> Scalars:
+def peaks(robot: Robot, signals: Signals) -> Scalars:
     """Values at an instant whose largest values are recorded. The cell voltage is negated."""
-    cell = jnp.where(found.battery > 0.5, found.voltage_source / robot.battery.cells, jnp.inf)
-    assert found.temperature is not None
+    cell_voltage = jnp.where(signals.battery > 0.5, signals.voltage_source / robot.battery.cells, jnp.inf)
+    assert signals.temperature is not None
     return {
-        "current": jnp.abs(robot.sides * found.current),
-        "torque": jnp.abs(found.torque_gear),
-        "temperature": found.temperature,
-        "motor_speed": jnp.abs(found.speed_motor),
-        "speed": jnp.abs(found.speed),
-        "cell_low": -cell,
+        "current": jnp.abs(robot.sides * signals.current),
+        "torque": jnp.abs(signals.torque_gear),
+        "temperature": signals.temperature,
+        "motor_speed": jnp.abs(signals.speed_motor),
+        "speed": jnp.abs(signals.speed),
+        "cell_low": -cell_voltage,
     }
 
 
@@ -197,10 +202,10 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
     }
 
 
-def exceeded(robot: Robot, found: Signals) -> Scalars:
+def exceeded(robot: Robot, signals: Signals) -> Scalars:
     """Limits exceeded at an instant."""
-    is_too_hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
-    return {**base.exceeded_limits(robot, found), "too_hot": is_too_hot}
+    is_too_hot = jnp.asarray(signals.temperature) > robot.motor.temperature_limit
+    return {**base.exceeded_limits(robot, signals), "too_hot": is_too_hot}
 
 
 def limited(robot: Robot, y: Array) -> Array:
@@ -209,7 +214,7 @@ def limited(robot: Robot, y: Array) -> Array:
 
 
 #: Norm of an error of the unknowns, relative to the tolerance [-].
-norm = functools.partial(rosenbrock.error_norm, own=len(UNITS))
+norm = functools.partial(rosenbrock.error_norm, count=len(UNITS))
 
 
 def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
@@ -217,10 +222,10 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
     return segment.demand
 
 
-def status(robot: Robot, conditions: Conditions, found: Signals) -> Array:
+def status(robot: Robot, conditions: Conditions, signals: Signals) -> Array:
     """Status of a moving robot at its last instant."""
-    conditions_now = replace(conditions, discharge=found.discharge)
-    return rest.status_moving(robot, conditions_now, found, found.duty * found.voltage_source)
+    end_conditions = replace(conditions, discharge=signals.discharge)
+    return rest.status_moving(robot, end_conditions, signals, signals.duty * signals.voltage_source)
 
 
 def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:

@@ -20,8 +20,8 @@ from mmrjax.model.params import Scalar
 #: A number of each row.
 PerRow = Float[Array, " rows"]
 
-#: Drive of the motors in a segment: by a share of the supply's voltage; by the driver's controller, at a demanded
-#: motor speed or ground speed; or not driven, with terminals shorted (brake) or circuit open (coast).
+#: Drive of the motors in a segment. `voltage`: by a share of the supply's voltage. `motor_speed`, `speed`: by the
+#: driver's controller, at that demanded speed. `brake`: terminals shorted. `coast`: circuit open.
 MODES = ("voltage", "motor_speed", "speed", "brake", "coast")
 VOLTAGE, MOTOR_SPEED, SPEED, BRAKE, COAST = range(len(MODES))
 
@@ -114,10 +114,10 @@ class Profile(eqx.Module):
         def interpolate(x: Array) -> Array:
             return x[0] + (x[1] - x[0]) * share if self.linear else x[0]
 
-        still: dict[str, Any] = {"time": self.time[0], "mode": self.mode[0]}
-        nothing: dict[str, Any] = dict.fromkeys(still)
-        values = jax.tree.map(interpolate, replace(self, **nothing))
-        return replace(values, **still)
+        constant: dict[str, Any] = {"time": self.time[0], "mode": self.mode[0]}
+        unset: dict[str, Any] = dict.fromkeys(constant)
+        values = jax.tree.map(interpolate, replace(self, **unset))
+        return replace(values, **constant)
 
     def conditions(self, otherwise: Conditions) -> Conditions:
         """Conditions at an instant (see `at`). Those that the profile does not state are from `otherwise`."""
@@ -128,8 +128,8 @@ class Profile(eqx.Module):
         for name in ("duty", "duty_left", "duty_right"):
             duty = condition_values.get(name, getattr(otherwise, name))
             condition_values[name] = None if duty is None else jnp.where(is_undriven, 0.0, duty)
-        opened = jnp.where(self.mode == COAST, 1.0, jnp.where(self.mode == BRAKE, -1.0, otherwise.open))
-        return replace(otherwise, **condition_values, open=opened)
+        open_state = jnp.where(self.mode == COAST, 1.0, jnp.where(self.mode == BRAKE, -1.0, otherwise.open))
+        return replace(otherwise, **condition_values, open=open_state)
 
 
 Index = Int[Array, ""] | int
@@ -156,20 +156,20 @@ def profile(
         UsageError: fewer than two rows, a time that does not increase, an unknown mode or field. Also a length that
             differs from that of `time`, a value that is not finite, a duty beyond -1..1, cycles below 1.
     """
-    rows = np.asarray(time, float)
-    if rows.ndim != 1 or len(rows) < 2:
-        raise UsageError(f"profile, time: got {count_noun(rows.size, 'row')}; expected two or more")
-    if not np.isfinite(rows).all():
-        raise UsageError(f"profile, time: row {int(np.argmax(~np.isfinite(rows))) + 1} is not a finite number")
-    rows_of_falls = np.flatnonzero(np.diff(rows) <= 0)
-    if rows_of_falls.size:
-        k = int(rows_of_falls[0]) + 1
+    times = np.asarray(time, float)
+    if times.ndim != 1 or len(times) < 2:
+        raise UsageError(f"profile, time: got {count_noun(times.size, 'row')}; expected two or more")
+    if not np.isfinite(times).all():
+        raise UsageError(f"profile, time: row {int(np.argmax(~np.isfinite(times))) + 1} is not a finite number")
+    falls = np.flatnonzero(np.diff(times) <= 0)
+    if falls.size:
+        k = int(falls[0]) + 1
         raise UsageError(
-            f"profile, time: row {k + 1} has {rows[k]:g} s after {rows[k - 1]:g} s; expected a later time"
+            f"profile, time: row {k + 1} has {times[k]:g} s after {times[k - 1]:g} s; expected a later time"
         )
     if cycles < 1 or cycles != int(cycles):
         raise UsageError(f"profile, cycles: got {cycles}; expected a whole number from 1")
-    modes = [mode] * len(rows) if isinstance(mode, str) else list(mode)
+    modes = [mode] * len(times) if isinstance(mode, str) else list(mode)
     for k, name in enumerate(modes):
         if name not in MODES:
             raise UsageError(f"profile, mode, row {k + 1}: got {name}; expected {', '.join(MODES)}")
@@ -178,31 +178,31 @@ def profile(
     if unknown:
         raise UsageError(f"profile: no field {unknown[0]}; expected one of {', '.join(allowed)}")
     columns: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
-    if why := sides_error(list(columns), MODES[SPEED] in modes):
-        raise UsageError(f"profile: {why}")
+    if reason := sides_error(list(columns), MODES[SPEED] in modes):
+        raise UsageError(f"profile: {reason}")
     arrays = {}
     for name, value in columns.items():
         x = np.asarray(value, float)
-        if x.ndim > 1 or (x.ndim == 1 and len(x) != len(rows)):
+        if x.ndim > 1 or (x.ndim == 1 and len(x) != len(times)):
             raise UsageError(
-                f"profile, {name}: got {count_noun(x.shape[0] if x.ndim else 1, 'value')}; expected {len(rows)}"
+                f"profile, {name}: got {count_noun(x.shape[0] if x.ndim else 1, 'value')}; expected {len(times)}"
             )
         if not np.isfinite(x).all():
             raise UsageError(
                 f"profile, {name}: row {int(np.argmax(~np.isfinite(np.atleast_1d(x)))) + 1} is not finite"
             )
-        arrays[name] = as_array(np.broadcast_to(x, rows.shape))
+        arrays[name] = as_array(np.broadcast_to(x, times.shape))
     for name in ("duty", *PAIRS[0]):
         duty = np.atleast_1d(np.asarray(arrays.get(name, 0.0)))
         if (np.abs(duty) > 1).any():
             raise UsageError(f"profile, {name}: got {duty[np.argmax(np.abs(duty))]:g}; expected -1 to 1")
-    if len(modes) != len(rows):
-        raise UsageError(f"profile, mode: got {count_noun(len(modes), 'value')}; expected {len(rows)}")
-    index = as_array([MODES.index(name) for name in modes], int)
-    return Profile(time=as_array(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
+    if len(modes) != len(times):
+        raise UsageError(f"profile, mode: got {count_noun(len(modes), 'value')}; expected {len(times)}")
+    mode_indices = as_array([MODES.index(name) for name in modes], int)
+    return Profile(time=as_array(times), mode=mode_indices, linear=linear, cycles=int(cycles), **arrays)
 
 
-def sides_error(stated: Sequence[str], speed: bool, named: Callable[[str], str] = str) -> str | None:
+def sides_error(stated: Sequence[str], speed: bool, name_of: Callable[[str], str] = str) -> str | None:
     """Message if a profile's fields for the sides contradict each other, otherwise None.
 
     They do for one side without the other, two kinds at once, or a yaw rate without a demanded speed.
@@ -210,14 +210,14 @@ def sides_error(stated: Sequence[str], speed: bool, named: Callable[[str], str] 
     Args:
         stated: names of the stated fields.
         speed: True if a ground speed is demanded.
-        named: function from a field to its name in the input.
+        name_of: function from a field to its name in the input.
     """
-    for left, right in (pair for either in PAIRS for pair in (either, either[::-1])):
+    for left, right in (pair for names in PAIRS for pair in (names, names[::-1])):
         if left in stated and right not in stated:
-            return f"got {named(left)} without {named(right)}; expected both"
-    kinds = [named(name) for name in ("duty", PAIRS[0][0], PAIRS[1][0]) if name in stated]
-    if len(kinds) > 1:
-        return f"got {kinds[0]} together with {kinds[1]}; expected one of the two"
+            return f"got {name_of(left)} without {name_of(right)}; expected both"
+    stated_kinds = [name_of(name) for name in ("duty", PAIRS[0][0], PAIRS[1][0]) if name in stated]
+    if len(stated_kinds) > 1:
+        return f"got {stated_kinds[0]} together with {stated_kinds[1]}; expected one of the two"
     if YAW_RATE in stated and not speed:
-        return f"got {named(YAW_RATE)} without {named(MODES[SPEED])}; expected a demanded ground speed too"
+        return f"got {name_of(YAW_RATE)} without {name_of(MODES[SPEED])}; expected a demanded ground speed too"
     return None
