@@ -40,7 +40,7 @@ SMOOTH = 0.05
 #: Number of runs for a slope.
 BESIDE = 8
 #: Outputs of a climb: unit and words. For a robot that gets over, they are computed up to the crest, where its centre
-#: of mass passes the obstacle, because its fall afterwards is a different question. Margins are shares.
+#: of mass passes the obstacle. They do not include its fall after that. Margins are shares.
 OUTPUTS: dict[str, tuple[str, str]] = {
     "margin_success": ("-", "smoothed smallest of the four margins, above 0 if it gets over"),
     "margin_reach": (
@@ -84,30 +84,30 @@ def climb_outputs(robot: Robot, terrain: Terrain, record: ClimbRecord, crest: in
     reach = jnp.asarray((record.centre - terrain.finish) / (robot.running_gear.wheelbase / 2))
     # the crest is between two samples
     share = jnp.ones(()) if crest is None else -reach[crest - 1] / (reach[crest] - reach[crest - 1])
-    until: ClimbRecord = jax.tree.map(lambda x: x[: None if crest is None else crest + 1], record)
+    record_to_crest: ClimbRecord = jax.tree.map(lambda x: x[: None if crest is None else crest + 1], record)
 
-    def end(x: Scalar) -> Scalar:
+    def at_crest(x: Scalar) -> Scalar:
         x = jnp.asarray(x)
         return x[-2] + share * (x[-1] - x[-2])
 
-    driven = until.time >= SETTLES + RISES
-    stall = robot.motor.current_stall(jnp.where(driven, until.voltage, 1.0))
+    is_powered = record_to_crest.time >= SETTLES + RISES
+    stall = robot.motor.current_stall(jnp.where(is_powered, record_to_crest.voltage, 1.0))
     margins = {
         "margin_reach": reach[-1] if crest is None else jnp.ones(()),
-        "margin_upright": smooth_minimum(1 - jnp.abs(until.motion.q[:, PITCH]) / TURNED_OVER),
-        "margin_grip": smooth_minimum(jnp.asarray(1 - until.grip)),
-        "margin_torque": smooth_minimum(1 - jnp.where(driven, until.current, 0.0) / stall),
+        "margin_upright": smooth_minimum(1 - jnp.abs(record_to_crest.motion.q[:, PITCH]) / TURNED_OVER),
+        "margin_grip": smooth_minimum(jnp.asarray(1 - record_to_crest.grip)),
+        "margin_torque": smooth_minimum(1 - jnp.where(is_powered, record_to_crest.current, 0.0) / stall),
     }
-    levers = jnp.max(jnp.abs(until.lever_current), axis=0)
+    lever_currents = jnp.max(jnp.abs(record_to_crest.lever_current), axis=0)
     return {
         "margin_success": smooth_minimum(jnp.stack(list(margins.values()))),
         **margins,
-        "crest_time_s": end(until.time),
-        "crest_energy_J": end(until.energy["supply"] + until.energy["levers"]),
-        "crest_current_rms_A": jnp.sqrt(jnp.mean(until.current**2)),
-        "crest_current_most_A": jnp.max(jnp.abs(until.current)),
-        "crest_front_current_most_A": levers[0],
-        "crest_rear_current_most_A": levers[1],
+        "crest_time_s": at_crest(record_to_crest.time),
+        "crest_energy_J": at_crest(record_to_crest.energy["supply"] + record_to_crest.energy["levers"]),
+        "crest_current_rms_A": jnp.sqrt(jnp.mean(record_to_crest.current**2)),
+        "crest_current_most_A": jnp.max(jnp.abs(record_to_crest.current)),
+        "crest_front_current_most_A": lever_currents[0],
+        "crest_rear_current_most_A": lever_currents[1],
     }
 
 
@@ -116,21 +116,21 @@ class ClimbDerivatives(NamedTuple):
 
     Attributes:
         climb: the simulated climb.
-        found: outputs of the climb.
-        by: derivatives of the outputs, of shape (values,).
+        outputs: outputs of the climb.
+        derivatives: derivatives of the outputs, of shape (values,).
         slope, slope_sd: slopes of straight lines through `BESIDE` runs along each value, and their standard
             deviations.
     """
 
     climb: ClimbRuns
-    found: dict[str, float]
-    by: dict[str, Float[np.ndarray, " values"]]
+    outputs: dict[str, float]
+    derivatives: dict[str, Float[np.ndarray, " values"]]
     slope: dict[str, Float[np.ndarray, " values"]]
     slope_sd: dict[str, Float[np.ndarray, " values"]]
 
 
 def climb_derivatives(
-    given: Callable[[Float[Array, " values"]], ClimbInputs],
+    inputs_of: Callable[[Float[Array, " values"]], ClimbInputs],
     values: Float[Array, " values"],
     widths: Float[Array, " values"],
     *,
@@ -142,96 +142,104 @@ def climb_derivatives(
 ) -> ClimbDerivatives:
     """Outputs of one climb, their derivatives with respect to `values`, and slopes over `widths` to both sides.
 
-    `given` is a function of the values that returns robot, conditions, terrain and sequence. The other arguments are
-    as in `climb_batch`.
+    `inputs_of` returns robot, conditions, terrain and sequence for given values. The other arguments are as in
+    `climb_batch`.
     """
     directions = jnp.eye(len(values))
     parts, samples, steps = climb.divide_run(duration, step, sample, part)
-    interval, step_numbers = jnp.asarray(step, float), jnp.asarray(steps)
-    run, rotated_run = _value_and_derivatives_along(given, values, directions)
+    interval = jnp.asarray(step, float)
+    steps_per_sample = jnp.asarray(steps)
+    run, run_derivatives = _value_and_derivatives_along(inputs_of, values, directions)
 
     def begin(run: ClimbInputs) -> Any:
         return climb.begin_climb(climb.build_climb_system(*run, interval))
 
-    state, state_change = _value_and_derivatives_along(begin, run, rotated_run)
+    state, state_derivatives = _value_and_derivatives_along(begin, run, run_derivatives)
     records: list[Any] = []
     for k in range(parts):
-        first_step = jnp.asarray(k * samples * steps * step)
-        (state, record), (state_change, changed) = _advance_part(
-            (run, state), (rotated_run, state_change), first_step, interval, step_numbers, samples
+        first_time = jnp.asarray(k * samples * steps * step)
+        (state, record), (state_derivatives, record_derivatives) = _advance_part(
+            (run, state), (run_derivatives, state_derivatives), first_time, interval, steps_per_sample, samples
         )
-        records.append(jax.device_get((record, changed)))
+        records.append(jax.device_get((record, record_derivatives)))
         if progress is not None:
             progress((k + 1) / parts / 2)
         if state[2].verdict >= 0:
             break
     record = jax.tree.map(lambda *x: jnp.concatenate(x), *[r for r, _ in records])
-    changed = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *[c for _, c in records])
-    verdict, has_ended = int(state[2].verdict), state[2].ended
-    last = UNFINISHED if verdict < 0 else verdict, has_ended, state[2].furthest
-    all_runs = ClimbRuns(*jax.tree.map(lambda x: np.asarray(x)[None], (*last, record)))
-    ran = jax.tree.map(jnp.asarray, all_runs.run(0))
-    count = len(ran.time)
-    top = crest_sample(run.terrain, ran, verdict == OVER)
-    gradients, derivatives_by = _value_and_derivatives_along(
-        lambda run_of: climb_outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
-        (run, ran),
-        (rotated_run, jax.tree.map(lambda x: x[:, :count], changed)),
+    record_derivatives = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *[c for _, c in records])
+    verdict = int(state[2].verdict)
+    end_time = state[2].ended
+    final_values = UNFINISHED if verdict < 0 else verdict, end_time, state[2].furthest
+    all_runs = ClimbRuns(*jax.tree.map(lambda x: np.asarray(x)[None], (*final_values, record)))
+    run_record = jax.tree.map(jnp.asarray, all_runs.run(0))
+    count = len(run_record.time)
+    crest = crest_sample(run.terrain, run_record, verdict == OVER)
+    outputs, derivatives = _value_and_derivatives_along(
+        lambda run_and_record: climb_outputs(
+            run_and_record[0].robot, run_and_record[0].terrain, run_and_record[1], crest
+        ),
+        (run, run_record),
+        (run_derivatives, jax.tree.map(lambda x: x[:, :count], record_derivatives)),
     )
     offsets = np.linspace(-1, 1, BESIDE)
     nearby_values = jnp.concatenate([values + np.outer(offsets, unit * widths) for unit in directions])
-    more = jax.vmap(given)(nearby_values)
+    nearby_inputs = jax.vmap(inputs_of)(nearby_values)
     batch = climb.climb_batch(
-        *more, duration=duration, step=step, sample=sample, part=part,
+        *nearby_inputs, duration=duration, step=step, sample=sample, part=part,
         progress=None if progress is None else lambda share: progress((1 + share) / 2),
     )  # fmt: skip
-    single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(nearby_values)))
-    other_outputs = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
-    slope, sd = {}, {}
-    for name in gradients:
-        y = np.array([float(other[name]) for other in other_outputs]).reshape(-1, BESIDE)
-        square, deviations = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
+    nearby_robots = (
+        jax.tree.map(lambda x, k=k: x[k], (nearby_inputs.robot, nearby_inputs.terrain))
+        for k in range(len(nearby_values))
+    )
+    nearby_outputs = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(nearby_robots)]
+    slope, slope_sd = {}, {}
+    for name in outputs:
+        y = np.array([float(nearby[name]) for nearby in nearby_outputs]).reshape(-1, BESIDE)
+        square = np.sum(offsets**2)
+        deviations = y - y.mean(axis=1, keepdims=True)
         rise = deviations @ offsets / square
-        unexplained_rise = deviations - np.outer(rise, offsets)
+        residuals = deviations - np.outer(rise, offsets)
         slope[name] = rise / np.asarray(widths)
-        sd[name] = np.sqrt(np.sum(unexplained_rise**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
+        slope_sd[name] = np.sqrt(np.sum(residuals**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
     return ClimbDerivatives(
         all_runs,
-        {n: float(x) for n, x in gradients.items()},
-        {n: np.asarray(x) for n, x in derivatives_by.items()},
+        {name: float(x) for name, x in outputs.items()},
+        {name: np.asarray(x) for name, x in derivatives.items()},
         slope,
-        sd,
+        slope_sd,
     )
 
 
-def outputs_of_run(robot: Robot, terrain: Terrain, ended: ClimbRuns, k: int) -> Scalars:
+def outputs_of_run(robot: Robot, terrain: Terrain, runs: ClimbRuns, k: int) -> Scalars:
     """`OUTPUTS` of run `k` of a batch."""
-    record = jax.tree.map(jnp.asarray, ended.run(k))
-    return climb_outputs(robot, terrain, record, crest_sample(terrain, record, bool(ended.verdict[k] == OVER)))
+    record = jax.tree.map(jnp.asarray, runs.run(k))
+    return climb_outputs(robot, terrain, record, crest_sample(terrain, record, bool(runs.verdict[k] == OVER)))
 
 
-def _value_and_derivatives_along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[Any, Any]:
+def _value_and_derivatives_along(function: Callable[[Any], Any], point: Any, directions: Any) -> tuple[Any, Any]:
     """Value of a function and its derivatives along `directions`. Leaves have a first axis (None: zero)."""
-    numbers, static_parts = eqx.partition(at, eqx.is_inexact_array)
-    further: list[Any] = []
+    numbers, static_parts = eqx.partition(point, eqx.is_inexact_array)
+    static_outputs: list[Any] = []
 
-    def one(moved: Any) -> tuple[Any, Any, Any]:
-        def of_numbers(numbers: Any) -> tuple[Any, Any]:
-            numeric, others = eqx.partition(function(eqx.combine(numbers, static_parts)), eqx.is_inexact_array)
-            arrays, words = eqx.partition(others, eqx.is_array)
-            further.append(words)
+    def derivative_along(direction: Any) -> tuple[Any, Any, Any]:
+        def function_of_numbers(numbers: Any) -> tuple[Any, Any]:
+            numeric, other_leaves = eqx.partition(function(eqx.combine(numbers, static_parts)), eqx.is_inexact_array)
+            arrays, static_part = eqx.partition(other_leaves, eqx.is_array)
+            static_outputs.append(static_part)
             return numeric, arrays
 
-        return jax.jvp(of_numbers, (numbers,), (moved,), has_aux=True)
+        return jax.jvp(function_of_numbers, (numbers,), (direction,), has_aux=True)
 
-    values, changed, arrays = jax.vmap(one, out_axes=(None, 0, None))(directions)
-    return eqx.combine(values, arrays, further[-1]), changed
+    values, derivatives, arrays = jax.vmap(derivative_along, out_axes=(None, 0, None))(directions)
+    return eqx.combine(values, arrays, static_outputs[-1]), derivatives
 
 
 @functools.partial(compiled, options=SELDOM)
-def _advance_part(at: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
-    def advance(at: tuple[ClimbInputs, Any]) -> Any:
-        run, state = at
+def _advance_part(point: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
+    def advance(point: tuple[ClimbInputs, Any]) -> Any:
+        run, state = point
         return climb.advance_samples(climb.build_climb_system(*run, step), state, first, steps, samples)
 
-    return _value_and_derivatives_along(advance, at, directions)
+    return _value_and_derivatives_along(advance, point, directions)

@@ -2,7 +2,7 @@
 
 The bodies are the chassis with payload, two pulleys and two levers. The belts run rigidly with the pulleys. The
 levers' drives follow a sequence of angles, limited by the levers' rate, or have given voltages.
-`contacts_with_terrain` computes the contacts, `balances` the drive of the tracks, `lever_drives` that of the levers.
+`contacts_with_terrain` computes the contacts, `balances` the drive of the tracks, `step_levers` that of the levers.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class LeverSequence(eqx.Module):
     Values beyond the first and last knot are constant.
 
     Attributes:
-        at: knots: position of the middle of the wheelbase from the start of the obstacle [m], or time [s].
+        knots: position of the middle of the wheelbase from the start of the obstacle [m], or time [s].
         front, rear: values at the knots: angles, 0 along the wheelbase outward, positive up [rad], or voltages,
             positive up [V].
         begins: initial angles of front and rear levers that are driven by voltages [rad]. None: the sequence states
@@ -76,7 +76,7 @@ class LeverSequence(eqx.Module):
         supply: highest voltage of the lever motors [V]. None: that of the supply.
     """
 
-    at: Float[Array, " knots"]
+    knots: Float[Array, " knots"]
     front: Float[Array, " knots"]
     rear: Float[Array, " knots"]
     begins: Pair | None = None
@@ -86,12 +86,12 @@ class LeverSequence(eqx.Module):
     @property
     def first(self) -> Pair:
         """Initial ψ of both levers [rad]."""
-        return _convert_lever_angles(*(self.asked(-jnp.inf, 0.0) if self.begins is None else self.begins))
+        return _convert_lever_angles(*(self.demand(-jnp.inf, 0.0) if self.begins is None else self.begins))
 
-    def asked(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
+    def demand(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
         """Demanded angles of front and rear [rad], or voltages of their motors, positive up [V]."""
         abscissa = time if self.over_time else place
-        return jnp.interp(abscissa, self.at, self.front), jnp.interp(abscissa, self.at, self.rear)
+        return jnp.interp(abscissa, self.knots, self.front), jnp.interp(abscissa, self.knots, self.rear)
 
 
 def _convert_lever_angles(front: Array, rear: Array) -> Pair:
@@ -114,7 +114,7 @@ class ClimbMotion(eqx.Module):
     v: Float[Array, " 6"]
     current: Scalar
     discharge: Scalar
-    drawn: Scalar
+    lever_supply_current: Scalar
 
 
 #: Sources and sinks of energy: input of the motors of tracks and of levers, then losses.
@@ -200,7 +200,7 @@ def build_climb_system(
     chassis = robot.chassis(conditions.configuration)
     half = without_levers(robot, conditions, mass)
     shape = footing.contact_shape_of_robot(chassis, gear, robot.radius_pulley)
-    none = jnp.zeros_like(chassis.on_tracks)
+    no_loss = jnp.zeros_like(chassis.on_tracks)
     lever = jnp.stack([gear.lever_mass, gear.lever_centre, gear.lever_inertia]) * jnp.stack(
         [chassis.on_tracks, jnp.ones(()), chassis.on_tracks]
     )
@@ -208,7 +208,7 @@ def build_climb_system(
         jax.tree.map(lambda tracked, wheeled: jnp.where(chassis.on_tracks > 0.5, tracked, wheeled), *tracks)
         for tracks in zip(
             gear.levers.tracks(chassis.track),
-            (chassis.track, dataclasses.replace(chassis.track, loss_coulomb=none, loss_viscous=none)),
+            (chassis.track, dataclasses.replace(chassis.track, loss_coulomb=no_loss, loss_viscous=no_loss)),
             strict=True,
         )
     )
@@ -239,14 +239,16 @@ def mass_matrix_and_bias(
     """
     half, shape = run.half, run.shape
     body, *levers = footing.part_frames(shape, q)
-    down = GRAVITY * jnp.stack([jnp.sin(run.conditions.slope), jnp.cos(run.conditions.slope)])
+    gravity = GRAVITY * jnp.stack([jnp.sin(run.conditions.slope), jnp.cos(run.conditions.slope)])
     zero, one = jnp.zeros(()), jnp.ones(())
 
-    def across(arm: Array) -> Array:
+    def turning_velocity(arm: Array) -> Array:
         """Velocity of a point at `arm` that rotates nose down, per angular speed."""
         return jnp.stack([arm[1], -arm[0]])
 
-    matrix, bias, height = jnp.zeros((COORDINATES, COORDINATES)), jnp.zeros(COORDINATES), zero
+    matrix = jnp.zeros((COORDINATES, COORDINATES))
+    bias = jnp.zeros(COORDINATES)
+    height = zero
     mass_lever, centre_lever = run.lever[0], run.lever[1]
     masses: list[tuple[Scalar, Array, Array | None, int | None]] = []
     arm = body.along(jnp.stack([half.forward, half.up]))
@@ -256,21 +258,21 @@ def mass_matrix_and_bias(
         masses.append((half.pulley, axle, None, None))
         reach = lever.along(jnp.stack([centre_lever, zero]))
         masses.append((mass_lever, axle + reach, reach, lever.turns))
-    for mass, place, out, turns in masses:
-        columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), across(place), *[jnp.zeros(2)] * 3]
+    for mass, place, lever_arm, turns in masses:
+        columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), turning_velocity(place), *[jnp.zeros(2)] * 3]
         centrifugal = -place * v[PITCH] ** 2
-        if out is not None and turns is not None:
-            columns[turns] = -across(out)
-            centrifugal = -(place - out) * v[PITCH] ** 2 - out * (v[PITCH] - v[turns]) ** 2
-        moves = jnp.stack(columns, axis=1)
-        matrix = matrix + mass * moves.T @ moves
-        bias = bias + mass * moves.T @ (centrifugal + down)
-        height = height + mass * down @ (body.origin + place)
-    turning = [(half.inertia, {PITCH: 1.0}), (2 * half.inertia_pulley, {PITCH: 1.0, SHAFT: 1.0})]
-    turning += [(run.lever[2], {PITCH: 1.0, k: -1.0}) for k in (FRONT, REAR)]
-    for about, shares in turning:
+        if lever_arm is not None and turns is not None:
+            columns[turns] = -turning_velocity(lever_arm)
+            centrifugal = -(place - lever_arm) * v[PITCH] ** 2 - lever_arm * (v[PITCH] - v[turns]) ** 2
+        jacobian = jnp.stack(columns, axis=1)
+        matrix = matrix + mass * jacobian.T @ jacobian
+        bias = bias + mass * jacobian.T @ (centrifugal + gravity)
+        height = height + mass * gravity @ (body.origin + place)
+    rotating = [(half.inertia, {PITCH: 1.0}), (2 * half.inertia_pulley, {PITCH: 1.0, SHAFT: 1.0})]
+    rotating += [(run.lever[2], {PITCH: 1.0, k: -1.0}) for k in (FRONT, REAR)]
+    for inertia, shares in rotating:
         row = jnp.zeros(COORDINATES).at[np.array(list(shares))].set(jnp.array(list(shares.values())))
-        matrix = matrix + about * jnp.outer(row, row)
+        matrix = matrix + inertia * jnp.outer(row, row)
     return matrix, bias, height
 
 
@@ -284,59 +286,62 @@ class _ContactForces(eqx.Module):
 
 
 class _LeveredContacts(eqx.Module):
-    at: Footing
+    contacts: Footing
     v: Array
     radius: Scalar
-    levers: Scalar  # losses of the levers' tracks, at the shaft [N·m]
+    lever_torque: Scalar  # losses of the levers' tracks, at the shaft [N·m]
 
     @property
     def normal(self) -> Scalar:
         """Total normal load on all rolling contacts of one side [N]."""
-        return jnp.sum(self.at.force * self.at.rolls)
+        return jnp.sum(self.contacts.force * self.contacts.rolls)
 
     def pull(self, chassis: Chassis, signals: Signals) -> _ContactForces:
         """Friction of the contacts (25) by Fig. 7, and of the guide (26)."""
-        touching = self.at
+        contacts = self.contacts
         force = jnp.asarray(
-            chassis.ground.traction(_sliding(touching, self.v, signals), touching.force, signals.adhesion)
+            chassis.ground.traction(_sliding(contacts, self.v, signals), contacts.force, signals.adhesion)
         )
-        guide = jnp.sum(chassis.track.guide_friction * touching.guided * touching.force * signals.direction)
-        load = (
+        guide = jnp.sum(chassis.track.guide_friction * contacts.guided * contacts.force * signals.direction)
+        load_torque = (
             guide * self.radius
-            + self.levers
-            - jnp.sum(force * touching.along[:, SHAFT] + touching.force * touching.off[:, SHAFT])
+            + self.lever_torque
+            - jnp.sum(force * contacts.along[:, SHAFT] + contacts.force * contacts.off[:, SHAFT])
         )
-        return _ContactForces(jnp.sum(force), guide, load, force)
+        return _ContactForces(jnp.sum(force), guide, load_torque, force)
 
 
-def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
-    return -(at.along @ v) - signals.speed_slip_terms
+def _sliding(contacts: Footing, v: Array, signals: Signals) -> Array:
+    return -(contacts.along @ v) - signals.speed_slip_terms
 
 
 def climb_instant(
-    run: ClimbSystem, motion: ClimbMotion, on: Scalar
+    run: ClimbSystem, motion: ClimbMotion, voltage_share: Scalar
 ) -> tuple[Signals, Footing, _ContactForces, Array]:
-    """All signals, contacts, forces and load shares of an instant. `on`: fraction of the voltage that is applied to
-    each motor.
+    """All signals, contacts, forces and load shares of an instant.
+
+    `voltage_share` is the fraction of the voltage that is applied to each motor.
     """
-    touching = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
+    contacts = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
     # share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean
-    bearing_force = touching.force * touching.rolls
+    bearing_force = contacts.force * contacts.rolls
     share = bearing_force / jnp.maximum(jnp.sum(bearing_force), 1e-9)
-    speed = share @ (touching.carried @ motion.v)
-    conditions = _driven(run, on)
+    speed = share @ (contacts.carried @ motion.v)
+    conditions = _driven(run, voltage_share)
 
     ratio = run.robot.gearbox.ratio
     state = State(motion.current, ratio * motion.v[SHAFT], speed, motion.discharge)
     mover = _LeveredContacts(
-        touching, motion.v, run.shape.main.first, jnp.sum(_lever_loss(run, motion.v[SHAFT] + motion.v[LED]))
+        contacts, motion.v, run.shape.main.first, jnp.sum(_lever_loss(run, motion.v[SHAFT] + motion.v[LED]))
     )
-    signals, pulled = balances.resolved_signals(run.robot, conditions, state, mover, 2 * run.half.inertia_pulley)
-    return signals, touching, pulled, share
+    signals, contact_forces = balances.resolved_signals(
+        run.robot, conditions, state, mover, 2 * run.half.inertia_pulley
+    )
+    return signals, contacts, contact_forces, share
 
 
-def _driven(run: ClimbSystem, on: Scalar) -> Conditions:
-    return dataclasses.replace(run.conditions, duty=run.conditions.duty * on)
+def _driven(run: ClimbSystem, voltage_share: Scalar) -> Conditions:
+    return dataclasses.replace(run.conditions, duty=run.conditions.duty * voltage_share)
 
 
 def _lever_loss(run: ClimbSystem, speed: Array) -> Array:
@@ -348,34 +353,37 @@ def _lever_loss(run: ClimbSystem, speed: Array) -> Array:
 def _with_lever_current(run: ClimbSystem, motion: ClimbMotion) -> ClimbSystem:
     """Run in which the current of the lever motors is added to the battery's other consumers, I_s of eq. (10)."""
     battery = run.robot.battery
-    battery = dataclasses.replace(battery, current_other=battery.current_other + motion.drawn)
+    battery = dataclasses.replace(battery, current_other=battery.current_other + motion.lever_supply_current)
     return dataclasses.replace(run, robot=dataclasses.replace(run.robot, battery=battery))
 
 
 def _drive_action(
-    run: ClimbSystem, motion: ClimbMotion, time: Scalar, source: Scalar, free: Array, yields: Array
+    run: ClimbSystem, motion: ClimbMotion, time: Scalar, source: Scalar, free_rates: Array, rate_per_torque: Array
 ) -> LeverStep:
-    """Action of the lever drives in a step. Without it, the rates after the step would be `free` [rad/s]."""
-    levers, sequence = run.robot.running_gear.levers, run.sequence
+    """Action of the lever drives in a step. Without it, the rates after the step would be `free_rates` [rad/s]."""
+    levers = run.robot.running_gear.levers
+    sequence = run.sequence
     lever_voltage = jnp.abs(source) if sequence.supply is None else sequence.supply
     high = jnp.stack([lever_voltage, lever_voltage])
     low = -high
     # The levers move to the angles of the sequence, at most at their largest rate. One that has reached its angle
     # stands still.
     rate = run.robot.running_gear.levers.rate
-    toward = (_convert_lever_angles(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
-    speed = motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
-    aims = jnp.where((jnp.abs(toward) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, speed)
+    approach_rate = (_convert_lever_angles(*run.sequence.demand(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
+    led_rates = motion.v[LED] + run.step / _SWINGS * (jnp.clip(approach_rate, -rate, rate) - motion.v[LED])
+    demanded_rates = jnp.where((jnp.abs(approach_rate) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, led_rates)
     if sequence.begins is not None:
-        aims = jnp.zeros_like(aims)
-        front, rear = sequence.asked(motion.q[0], time)
+        demanded_rates = jnp.zeros_like(demanded_rates)
+        front, rear = sequence.demand(motion.q[0], time)
         low = high = jnp.clip(jnp.stack([front, -rear]), low, high)
     # beyond its range a lever is not driven further
     angles = _convert_lever_angles(*motion.q[LED])
     above_range, below_range = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
-    up, down = jnp.stack([above_range[0], below_range[1]]), jnp.stack([below_range[0], above_range[1]])
-    low, high = (jnp.where(up, jnp.minimum(x, 0.0), jnp.where(down, jnp.maximum(x, 0.0), x)) for x in (low, high))
-    return step_levers(run.drive, run.step, motion.v[LED], free, yields, aims, low, high)
+    blocks_up, blocks_down = jnp.stack([above_range[0], below_range[1]]), jnp.stack([below_range[0], above_range[1]])
+    low, high = (
+        jnp.where(blocks_up, jnp.minimum(x, 0.0), jnp.where(blocks_down, jnp.maximum(x, 0.0), x)) for x in (low, high)
+    )
+    return step_levers(run.drive, run.step, motion.v[LED], free_rates, rate_per_torque, demanded_rates, low, high)
 
 
 def advance_climb(
@@ -390,120 +398,145 @@ def advance_climb(
     Returns:
         Motion and energy after the step, and the record of the instant before it.
     """
-    run, on = _with_lever_current(run, motion), jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
-    signals, touching, pulled, share = climb_instant(run, motion, on)
-    robot, step, radius = run.robot, run.step, run.shape.main.first
+    run = _with_lever_current(run, motion)
+    voltage_share = jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
+    signals, contacts, contact_forces, share = climb_instant(run, motion, voltage_share)
+    robot = run.robot
+    step = run.step
+    radius = run.shape.main.first
     matrix, bias, height = mass_matrix_and_bias(run, motion.q, motion.v)
-    ratio, rotor = robot.gearbox.ratio, robot.motor.inertia
-    armature = rotor * ratio**2 * signals.efficiency_load + signals.inertia_added
-    resisted = signals.resistance * (share @ touching.carried)
-    force = pulled.force @ touching.along + touching.force @ touching.off - resisted
-    force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
-    belts = motion.v[SHAFT] + motion.v[LED]
-    lever_loss, stiffens = value_and_slope(lambda speed: _lever_loss(run, speed), belts)
-    stiffens = jnp.maximum(stiffens, 0.0)
+    ratio, rotor_inertia = robot.gearbox.ratio, robot.motor.inertia
+    armature = rotor_inertia * ratio**2 * signals.efficiency_load + signals.inertia_added
+    resistance_forces = signals.resistance * (share @ contacts.carried)
+    force = contact_forces.force @ contacts.along + contacts.force @ contacts.off - resistance_forces
+    force = force.at[SHAFT].set(signals.torque_net - resistance_forces[SHAFT])
+    lever_belt_speeds = motion.v[SHAFT] + motion.v[LED]
+    lever_loss, lever_loss_slope = value_and_slope(lambda speed: _lever_loss(run, speed), lever_belt_speeds)
+    lever_loss_slope = jnp.maximum(lever_loss_slope, 0.0)
     force = force.at[LED].add(-lever_loss)
 
-    rises = jnp.maximum(
-        run.chassis.ground.traction_rise(_sliding(touching, motion.v, signals), touching.force, signals.adhesion), 0
+    traction_slope = jnp.maximum(
+        run.chassis.ground.traction_rise(_sliding(contacts, motion.v, signals), contacts.force, signals.adhesion), 0
     )
-    shaft = _shaft_loss(run, motion, signals, touching)
-    damping = contact_damping(touching.along, touching.off, pulled.force, touching.force, rises, touching.damped)
-    damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
+    shaft_damping = _shaft_loss(run, motion, signals, contacts)
+    damping = contact_damping(
+        contacts.along, contacts.off, contact_forces.force, contacts.force, traction_slope, contacts.damped
+    )
+    damping = damping.at[SHAFT, SHAFT].add(shaft_damping) + (_ON_BELTS.T * lever_loss_slope) @ _ON_BELTS
     full_matrix = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
     # of wheels, with massless levers
     full_matrix = full_matrix.at[LED, LED].add(1 - run.chassis.on_tracks)
-    pushed = step * (force - bias)
+    impulse = step * (force - bias)
     factors = factorise(full_matrix[:4, :4])
     # Change of the other velocities while the levers keep theirs, and its share per change of the levers' rates.
-    change, *coupled = (solve_factorised(factors, x) for x in (pushed[:4], full_matrix[:4, 4], full_matrix[:4, 5]))
-    coupling = jnp.stack(coupled, axis=1)
+    other_change, *lever_columns = (
+        solve_factorised(factors, x) for x in (impulse[:4], full_matrix[:4, 4], full_matrix[:4, 5])
+    )
+    coupling = jnp.stack(lever_columns, axis=1)
     coupled_matrix = full_matrix[4:, 4:] - full_matrix[4:, :4] @ coupling
     inverse = jnp.array(
         [[coupled_matrix[1, 1], -coupled_matrix[0, 1]], [-coupled_matrix[1, 0], coupled_matrix[0, 0]]]
     ) / (coupled_matrix[0, 0] * coupled_matrix[1, 1] - coupled_matrix[0, 1] * coupled_matrix[1, 0])
-    lever_speeds = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ change)
-    swung = _drive_action(run, motion, time, signals.voltage_source, lever_speeds, step * inverse / robot.sides)
-    led = swung.rate - motion.v[LED]
-    gained = jnp.concatenate([change - coupling @ led, led])
-    v = motion.v + gained
-    middle = motion.v + gained / 2
+    lever_speeds = motion.v[LED] + inverse @ (impulse[4:] - full_matrix[4:, :4] @ other_change)
+    lever_action = _drive_action(
+        run, motion, time, signals.voltage_source, lever_speeds, step * inverse / robot.sides
+    )
+    lever_change = lever_action.rate - motion.v[LED]
+    velocity_change = jnp.concatenate([other_change - coupling @ lever_change, lever_change])
+    v = motion.v + velocity_change
+    middle = motion.v + velocity_change / 2
 
     charge = balances.charge_drawn(robot, run.conditions, signals.total_current)
-    current = current_after(robot, _driven(run, on), step, signals)
-    lever_current = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
-    after = ClimbMotion(motion.q + step * v, v, current, motion.discharge + step * charge, lever_current)
+    current = current_after(robot, _driven(run, voltage_share), step, signals)
+    lever_supply_current = (
+        lever_action.voltage @ lever_action.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
+    )
+    after = ClimbMotion(motion.q + step * v, v, current, motion.discharge + step * charge, lever_supply_current)
 
-    pair = run.drive
+    drive = run.drive
     # (1 / step) is the compiler's form of a division by a constant: a step passed as an argument gives the same bits
-    geared = (pair.constant * swung.current - pair.inertia * led * (1 / step) - swung.torque) @ middle[LED]
-    off, along = touching.off @ gained, touching.along @ gained
-    normal = touching.force - touching.damped * off
-    friction = pulled.force - rises * along - pulled.force / jnp.maximum(touching.force, 1e-9) * touching.damped * off
-    motor = ratio * middle[SHAFT]
-    drive = signals.torque_motor - signals.torque_idle
-    mesh = drive - rotor * ratio * gained[SHAFT] * (1 / step)
-    imbalance = signals.torque_load - signals.torque_track_loss - (pulled.load - pulled.guide * radius)
-    rise = current - signals.current
-    mean, resistance = signals.current + rise / 2, robot.motor.resistance
-    added = run.step * robot.sides * jnp.stack([
-        signals.voltage * mean,
-        swung.voltage @ swung.current / robot.sides,
-        (signals.voltage_drop + resistance * rise / 2) * mean + resistance * rise**2 / 12,
-        signals.torque_motor_loss * motor,
-        (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + imbalance * middle[SHAFT],
-        (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT]
-        + (lever_loss + stiffens * (_ON_BELTS @ gained)) @ (_ON_BELTS @ middle),
-        -friction @ (touching.along @ middle),
-        -(normal - touching.elastic) @ (touching.off @ middle),
-        resisted @ middle,
-        pair.resistance * swung.current @ swung.current / robot.sides,
-        geared / robot.sides,
+    lever_gear_loss = (
+        drive.constant * lever_action.current - drive.inertia * lever_change * (1 / step) - lever_action.torque
+    ) @ middle[LED]
+    off_change, along_change = contacts.off @ velocity_change, contacts.along @ velocity_change
+    normal = contacts.force - contacts.damped * off_change
+    friction = (
+        contact_forces.force
+        - traction_slope * along_change
+        - contact_forces.force / jnp.maximum(contacts.force, 1e-9) * contacts.damped * off_change
+    )
+    motor_speed = ratio * middle[SHAFT]
+    driving_torque = signals.torque_motor - signals.torque_idle
+    mesh_torque = driving_torque - rotor_inertia * ratio * velocity_change[SHAFT] * (1 / step)
+    imbalance = (
+        signals.torque_load - signals.torque_track_loss - (contact_forces.load - contact_forces.guide * radius)
+    )
+    current_rise = current - signals.current
+    mean_current = signals.current + current_rise / 2
+    resistance = robot.motor.resistance
+    step_energies = run.step * robot.sides * jnp.stack([
+        signals.voltage * mean_current,
+        lever_action.voltage @ lever_action.current / robot.sides,
+        (signals.voltage_drop + resistance * current_rise / 2) * mean_current + resistance * current_rise**2 / 12,
+        signals.torque_motor_loss * motor_speed,
+        (signals.torque_idle + (1 - signals.efficiency_load) * mesh_torque) * motor_speed + imbalance * middle[SHAFT],
+        (signals.torque_track_loss + shaft_damping * velocity_change[SHAFT]) * middle[SHAFT]
+        + (lever_loss + lever_loss_slope * (_ON_BELTS @ velocity_change)) @ (_ON_BELTS @ middle),
+        -friction @ (contacts.along @ middle),
+        -(normal - contacts.elastic) @ (contacts.off @ middle),
+        resistance_forces @ middle,
+        drive.resistance * lever_action.current @ lever_action.current / robot.sides,
+        lever_gear_loss / robot.sides,
     ])  # fmt: skip
-    spent = {name: energy[name] + added[k] for k, name in enumerate((*SOURCES, *LOSSES))}
-    kinetic = motion.v @ matrix @ motion.v + (signals.inertia_added + rotor * ratio**2) * motion.v[SHAFT] ** 2
-    stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(touching.energy)
-    up = jnp.array([1.0, -1.0])  # for a rear lever, upward is decreasing ψ
-    total = jnp.sum(touching.force)
-    adhesion_force = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
+    energy_after = {name: energy[name] + step_energies[k] for k, name in enumerate((*SOURCES, *LOSSES))}
+    kinetic = motion.v @ matrix @ motion.v + (signals.inertia_added + rotor_inertia * ratio**2) * motion.v[SHAFT] ** 2
+    stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(contacts.energy)
+    upward = jnp.array([1.0, -1.0])  # for a rear lever, upward is decreasing ψ
+    total_force = jnp.sum(contacts.force)
+    adhesion_force = run.chassis.ground.force_adhesion(jnp.sum(contacts.force * contacts.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
-    is_loaded, ahead = touching.force > 0, touching.place - centre
+    is_loaded = contacts.force > 0
+    ahead_of_centre = contacts.place - centre
     record = ClimbRecord(
         time=time,
         motion=motion,
         current=signals.current,
-        total_current=signals.total_current + lever_current,
+        total_current=signals.total_current + lever_supply_current,
         voltage=signals.voltage,
-        torque=up * swung.torque,
-        lever_current=up * swung.current,
-        lever_voltage=up * swung.voltage,
-        holds=1.0 * swung.holds,
+        torque=upward * lever_action.torque,
+        lever_current=upward * lever_action.current,
+        lever_voltage=upward * lever_action.voltage,
+        holds=1.0 * lever_action.holds,
         energy=energy,
-        stored=robot.sides * stored + pair.inertia * motion.v[LED] @ motion.v[LED] / 2,
-        normal=total,
-        body=jnp.sum(touching.force * (1 - touching.rolls)) / jnp.maximum(total, 1e-9),
-        grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(adhesion_force, 1e-9),
-        carried=total / (GRAVITY * matrix[0, 0]),
+        stored=robot.sides * stored + drive.inertia * motion.v[LED] @ motion.v[LED] / 2,
+        normal=total_force,
+        body=jnp.sum(contacts.force * (1 - contacts.rolls)) / jnp.maximum(total_force, 1e-9),
+        grip=jnp.sum(jnp.abs(contact_forces.force) * contacts.rolls) / jnp.maximum(adhesion_force, 1e-9),
+        carried=total_force / (GRAVITY * matrix[0, 0]),
         centre=centre,
-        base=jnp.stack([jnp.max(jnp.where(is_loaded, way, -jnp.inf)) for way in (-ahead, ahead)]),
+        base=jnp.stack(
+            [jnp.max(jnp.where(is_loaded, distance, -jnp.inf)) for distance in (-ahead_of_centre, ahead_of_centre)]
+        ),
     )
-    return after, spent, record
+    return after, energy_after, record
 
 
-def _shaft_loss(run: ClimbSystem, motion: ClimbMotion, signals: Signals, at: Footing) -> Scalar:
+def _shaft_loss(run: ClimbSystem, motion: ClimbMotion, signals: Signals, contacts: Footing) -> Scalar:
     """Derivative of the drive's losses with respect to the shaft speed, at least 0 [N·m·s]. It is large at rest.
 
     Contacts and winding are excluded because they are resolved in time.
     """
     one = jnp.ones_like(motion.v[SHAFT])
-    force = jnp.sum(run.chassis.track.guide_friction * at.guided * at.force) * run.shape.main.first
+    force = jnp.sum(run.chassis.track.guide_friction * contacts.guided * contacts.force) * run.shape.main.first
 
     def loss(speed: Scalar) -> Scalar:
         direction = contact.smooth_sign(run.chassis.radius * speed, run.chassis.speed_still)
-        motor = speed * run.robot.gearbox.ratio
-        idle_torque = run.robot.motor.torque_loss(motor, direction) + run.robot.gearbox.torque_idle(motor, direction)
-        track = run.chassis.track.torque_loss(speed, direction)
-        return track + force * direction + idle_torque * run.robot.gearbox.ratio * signals.efficiency_load
+        motor_speed = speed * run.robot.gearbox.ratio
+        idle_torque = run.robot.motor.torque_loss(motor_speed, direction) + run.robot.gearbox.torque_idle(
+            motor_speed, direction
+        )
+        track_loss = run.chassis.track.torque_loss(speed, direction)
+        return track_loss + force * direction + idle_torque * run.robot.gearbox.ratio * signals.efficiency_load
 
     return jnp.maximum(jax.jvp(loss, (motion.v[SHAFT],), (one,))[1], 0.0)
 
@@ -518,57 +551,57 @@ class VerdictState(eqx.Module):
     ended: Scalar
     furthest: Scalar
     since: Scalar
-    belt: Scalar
+    shaft_angle: Scalar
 
 
 def stand_before_obstacle(run: ClimbSystem, clear: float = 0.1) -> ClimbMotion:
     """Initial motion: at rest on the ground, with the foremost point `clear` [m] before the obstacle."""
     shape = run.shape
     angles = run.sequence.first
-    outer = shape.main.first + shape.gear.grouser_height
-    axle = jnp.where(shape.on_tracks > 0.5, outer, shape.wheel)
-    tip = shape.gear.lever_length * jnp.cos(angles[0]) + shape.gear.levers.roller
-    reach = shape.half + jnp.maximum(axle, jnp.where(shape.on_tracks > 0.5, tip, 0.0))
+    belt_radius = shape.main.first + shape.gear.grouser_height
+    axle = jnp.where(shape.on_tracks > 0.5, belt_radius, shape.wheel)
+    roller_reach = shape.gear.lever_length * jnp.cos(angles[0]) + shape.gear.levers.roller
+    reach = shape.half + jnp.maximum(axle, jnp.where(shape.on_tracks > 0.5, roller_reach, 0.0))
     x = -(reach + clear)
-    below = jnp.stack([x, jnp.zeros_like(x)])
-    gap, normal = (a[0] for a in run.terrain.distance(below[None]))
-    place = below + (axle - gap - 2e-5) * normal
+    ground_point = jnp.stack([x, jnp.zeros_like(x)])
+    gap, normal = (array[0] for array in run.terrain.distance(ground_point[None]))
+    place = ground_point + (axle - gap - 2e-5) * normal
     zero = jnp.zeros_like(x)
     q = jnp.stack([place[0], place[1], jnp.arctan2(normal[0], normal[1]), zero, angles[0], angles[1]])
     return ClimbMotion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero, zero)
 
 
 def _update_verdict(
-    run: ClimbSystem, before: ClimbMotion, passed: ClimbRecord, motion: ClimbMotion, progress: VerdictState
+    run: ClimbSystem, before: ClimbMotion, record: ClimbRecord, motion: ClimbMotion, progress: VerdictState
 ) -> tuple[ClimbMotion, VerdictState]:
     """Verdict of a run after one more sample. A run that has ended keeps its state."""
     q, v = motion.q, motion.v
-    outer = run.shape.main.first + run.shape.gear.grouser_height
-    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v)) & jnp.isfinite(motion.current)
-    finite = finite & (jnp.max(jnp.abs(v)) < 1e4)
+    belt_radius = run.shape.main.first + run.shape.gear.grouser_height
+    is_finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v)) & jnp.isfinite(motion.current)
+    is_finite = is_finite & (jnp.max(jnp.abs(v)) < 1e4)
     rear = q[0] - run.shape.half * jnp.cos(q[PITCH])
-    gained = q[0] > progress.furthest + GAIN
-    swings = jnp.max(jnp.abs(v[LED])) > 0.05
-    has_progressed = gained | swings | (passed.time < SETTLES)
+    has_advanced = q[0] > progress.furthest + GAIN
+    is_swinging = jnp.max(jnp.abs(v[LED])) > 0.05
+    has_progressed = has_advanced | is_swinging | (record.time < SETTLES)
     progress = VerdictState(
         progress.verdict,
-        jnp.where(progress.verdict == _RUNNING, passed.time, progress.ended),
-        jnp.where(gained, q[0], progress.furthest),
-        jnp.where(has_progressed, passed.time, progress.since),
-        jnp.where(has_progressed, q[SHAFT], progress.belt),
+        jnp.where(progress.verdict == _RUNNING, record.time, progress.ended),
+        jnp.where(has_advanced, q[0], progress.furthest),
+        jnp.where(has_progressed, record.time, progress.since),
+        jnp.where(has_progressed, q[SHAFT], progress.shaft_angle),
     )
-    waits = passed.time - progress.since
-    stuck = waits > PATIENCE
-    stands = jnp.abs(q[SHAFT] - progress.belt) * run.shape.main.first < STANDS * PATIENCE
+    waiting_time = record.time - progress.since
+    stuck = waiting_time > PATIENCE
+    is_standing = jnp.abs(q[SHAFT] - progress.shaft_angle) * run.shape.main.first < STANDS * PATIENCE
     fallen = q[1] < jnp.minimum(run.terrain.points[0, 1], run.terrain.points[-1, 1])
-    why = jnp.where(stands, STALLS, jnp.where((passed.body > BEARS) | fallen, HANGS, SLIDES))
-    verdict = jnp.where(stuck, why, _RUNNING)
-    verdict = jnp.where(rear > run.terrain.finish + outer, OVER, verdict)
+    stuck_verdict = jnp.where(is_standing, STALLS, jnp.where((record.body > BEARS) | fallen, HANGS, SLIDES))
+    verdict = jnp.where(stuck, stuck_verdict, _RUNNING)
+    verdict = jnp.where(rear > run.terrain.finish + belt_radius, OVER, verdict)
     verdict = jnp.where(jnp.abs(q[PITCH]) > TURNED_OVER, TIPS, verdict)
-    verdict = jnp.where(finite, verdict, FAILED)
+    verdict = jnp.where(is_finite, verdict, FAILED)
     has_ended = progress.verdict != _RUNNING
     verdict = jnp.where(has_ended, progress.verdict, verdict)
-    motion = jax.tree.map(lambda new, old: jnp.where(finite & ~has_ended, new, old), motion, before)
+    motion = jax.tree.map(lambda new, old: jnp.where(is_finite & ~has_ended, new, old), motion, before)
     return motion, dataclasses.replace(progress, verdict=verdict)
 
 
@@ -577,13 +610,14 @@ def begin_climb(run: ClimbSystem, motion: ClimbMotion | None = None) -> tuple[Cl
 
     The verdict is `failed` if the levers would start below the ground. Otherwise the run continues.
     """
-    angles, gear = _convert_lever_angles(*run.sequence.first), run.shape.gear
-    under = roller_clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
-    buried = jnp.any(under & (run.shape.on_tracks > 0.5)) & (motion is None)
+    angles = _convert_lever_angles(*run.sequence.first)
+    gear = run.shape.gear
+    is_below_ground = roller_clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
+    is_buried = jnp.any(is_below_ground & (run.shape.on_tracks > 0.5)) & (motion is None)
     motion = stand_before_obstacle(run) if motion is None else motion
     zero = jnp.zeros_like(motion.q[0])
     energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
-    return motion, energy, VerdictState(jnp.where(buried, FAILED, _RUNNING), zero, motion.q[0], zero, zero)
+    return motion, energy, VerdictState(jnp.where(is_buried, FAILED, _RUNNING), zero, motion.q[0], zero, zero)
 
 
 def roller_clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) -> Float[Array, " levers"]:
@@ -603,18 +637,18 @@ def advance_samples(
     def sample(state: Any, k: Array) -> tuple[Any, ClimbRecord]:
         motion, energy, progress = state
 
-        def small(j: Array, carry: Any) -> Any:
+        def advance_step(j: Array, carry: Any) -> Any:
             *after, record = advance_climb(run, carry[0], first + (k * steps + j) * run.step, carry[1])
             base = jnp.maximum(record.base, carry[2].base)
             return (*after, dataclasses.replace(record, base=base))
 
-        nothing = jax.eval_shape(lambda: advance_climb(run, motion, first, energy)[2])
-        nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
-        after, spent, passed = jax.lax.fori_loop(0, steps, small, (motion, energy, nothing))
+        no_record = jax.eval_shape(lambda: advance_climb(run, motion, first, energy)[2])
+        no_record = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), no_record)
+        after, energy_after, sample_record = jax.lax.fori_loop(0, steps, advance_step, (motion, energy, no_record))
         has_ended = progress.verdict != _RUNNING
-        after, progress = _update_verdict(run, motion, passed, after, progress)
-        energy_recorded = jax.tree.map(lambda new, old: jnp.where(has_ended, old, new), spent, energy)
-        return (after, energy_recorded, progress), passed
+        after, progress = _update_verdict(run, motion, sample_record, after, progress)
+        energy_kept = jax.tree.map(lambda new, old: jnp.where(has_ended, old, new), energy_after, energy)
+        return (after, energy_kept, progress), sample_record
 
     return jax.lax.scan(sample, state, jnp.arange(samples))
 
@@ -625,7 +659,8 @@ def divide_run(duration: float, step: float, sample: float, part: float) -> tupl
 
     A sample has a whole number of steps and all parts are equal, so the run may be a few samples longer.
     """
-    steps, parts = max(round(sample / step), 1), math.ceil(duration / part - 1e-9)
+    steps = max(round(sample / step), 1)
+    parts = math.ceil(duration / part - 1e-9)
     return parts, math.ceil(duration / (parts * steps * step) - 1e-9), steps
 
 
@@ -659,7 +694,7 @@ def _robot_axis(robot: Robot) -> int | None:
 
 
 @compiled
-def _begin(
+def _begin_batch(
     robot: Robot,
     conditions: Conditions,
     terrain: Terrain,
@@ -667,29 +702,33 @@ def _begin(
     step: Scalar,
     motion: ClimbMotion | None,
 ) -> Any:
-    def one(
+    def begin_one(
         robot: Robot, conditions: Conditions, terrain: Terrain, sequence: LeverSequence, motion: ClimbMotion | None
     ) -> Any:
         return begin_climb(build_climb_system(robot, conditions, terrain, sequence, step), motion)
 
-    return jax.vmap(one, in_axes=(_robot_axis(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
+    return jax.vmap(begin_one, in_axes=(_robot_axis(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
 
 
-def _part(
+def _advance_batch(
     robot: Robot, conditions: Conditions, terrain: Terrain, sequence: LeverSequence, state: Any, first: Scalar,
     step: Scalar, steps: Scalar, samples: int,
 ) -> tuple[Any, ClimbRecord]:  # fmt: skip
-    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: LeverSequence, state: Any) -> Any:
+    def advance_one(
+        robot: Robot, conditions: Conditions, terrain: Terrain, sequence: LeverSequence, state: Any
+    ) -> Any:
         return advance_samples(
             build_climb_system(robot, conditions, terrain, sequence, step), state, first, steps, samples
         )
 
     in_axes = (_robot_axis(robot), 0, 0, 0, 0)
-    parts: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=in_axes)(robot, conditions, terrain, sequence, state)
+    parts: tuple[Any, ClimbRecord] = jax.vmap(advance_one, in_axes=in_axes)(
+        robot, conditions, terrain, sequence, state
+    )
     return parts
 
 
-_compiled = compiled(_part, options=SMALL)
+_advance_compiled = compiled(_advance_batch, options=SMALL)
 
 
 def climb_batch(
@@ -720,21 +759,22 @@ def climb_batch(
     """
     parts, samples, steps = divide_run(duration, step, sample, part)
     # Arrays: one program for all lengths of a step.
-    interval, steps_per_sample = jnp.asarray(step, float), jnp.asarray(steps)
-    state = _begin(robot, conditions, terrain, sequence, interval, start)
+    interval = jnp.asarray(step, float)
+    steps_per_sample = jnp.asarray(steps)
+    state = _begin_batch(robot, conditions, terrain, sequence, interval, start)
     records: list[ClimbRecord] = []
     for k in range(parts):
-        begins = jnp.asarray(k * samples * steps * step)
-        state, passed = _compiled(
-            robot, conditions, terrain, sequence, state, begins, interval, steps_per_sample, samples
+        first_time = jnp.asarray(k * samples * steps * step)
+        state, part_record = _advance_compiled(
+            robot, conditions, terrain, sequence, state, first_time, interval, steps_per_sample, samples
         )
         verdict = np.asarray(state[2].verdict)
-        last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
-        records = [*(records if record else []), jax.device_get(last)]
+        kept_record = part_record if record else jax.tree.map(lambda x: x[:, -1:], part_record)
+        records = [*(records if record else []), jax.device_get(kept_record)]
         if progress is not None:
             progress((k + 1) / parts)
         if np.all(verdict != _RUNNING):
             break
     verdict = np.where(verdict == _RUNNING, UNFINISHED, verdict)
-    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *records)
-    return ClimbRuns(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined)
+    joined_record = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *records)
+    return ClimbRuns(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined_record)

@@ -65,9 +65,9 @@ class PartFrame(NamedTuple):
     angle: Scalar
     turns: int | None = None
 
-    def world(self, at: Array) -> Array:
+    def world(self, points: Array) -> Array:
         """Points of the part, in world coordinates."""
-        return self.origin + self.along(at)
+        return self.origin + self.along(points)
 
     def along(self, vector: Array) -> Array:
         """Directions of the part, in world coordinates."""
@@ -75,9 +75,9 @@ class PartFrame(NamedTuple):
         a, b = vector[..., 0], vector[..., 1]
         return jnp.stack([a * cos - b * sin, a * sin + b * cos], axis=-1)
 
-    def within(self, at: Array) -> Array:
+    def within(self, points: Array) -> Array:
         """World points, in coordinates of the part."""
-        return self._replace(origin=jnp.zeros(2), angle=-self.angle).along(at - self.origin)
+        return self._replace(origin=jnp.zeros(2), angle=-self.angle).along(points - self.origin)
 
 
 class Footing(eqx.Module):
@@ -117,11 +117,16 @@ class Footing(eqx.Module):
 class _ContactGroup(NamedTuple):
     """Contacts of one part.
 
-    Fields: contact points in the world, gaps, normals, displacement of the belt per angle of the pulleys (0 for the
-    body), shares on the guide, and whether the contacts carry load.
+    Attributes:
+        points, gap, normal: contact points in the world [m], gaps [m] and normals.
+        rate: displacement of the belt per angle of the pulleys, 0 for the body [m].
+        turns: coordinate of the lever that the part belongs to, None for body and main belt.
+        guided: share of a load that passes to the lower guide [-].
+        bears: 1 if the contacts carry load, else 0.
+        rolls: 0 for contacts of the body, else 1.
     """
 
-    at: Array
+    points: Array
     gap: Array
     normal: Array
     rate: Array
@@ -142,33 +147,34 @@ def part_frames(shape: ContactShape, q: Sequence[Scalar] | Array) -> tuple[PartF
 
 
 def _guided_share(shape: ContactShape, place: Array) -> Array:
-    """Share of a load at `place` on the main belt that passes to the lower guide [-], as in `belt.tips_on_path`."""
+    """Share of a load at `place` on the main belt that passes to the lower guide [-], see `tips_on_path`."""
     run, length = shape.main.run, shape.main.length
-    off = jnp.minimum(place, length - place)  # from the middle of the lower run
-    return jnp.asarray(contact.cubic_step(run / 2 - off, 0.0, 0.0, shape.gear.guide_gap, 1.0))
+    distance = jnp.minimum(place, length - place)  # from the middle of the lower run
+    return jnp.asarray(contact.cubic_step(run / 2 - distance, 0.0, 0.0, shape.gear.guide_gap, 1.0))
 
 
 def _belt_contacts(
-    shape: ContactShape, terrain: Terrain, belt: BeltLoop, frame: PartFrame, drawn: Scalar, bears: Scalar
+    shape: ContactShape, terrain: Terrain, belt: BeltLoop, frame: PartFrame, belt_travel: Scalar, bears: Scalar
 ) -> list[_ContactGroup]:
     """Contacts of a belt: its grousers on the ground, and corners of the ground on the belt and on flanks of
     grousers.
     """
-    radius, main = shape.main.first, frame.turns is None
-    place = belt.places(drawn)
+    radius = shape.main.first
+    is_main = frame.turns is None
+    place = belt.places(belt_travel)
     tips, rate = grouser_tips(belt, place)
     points = frame.world(tips)
     gap, normal = terrain.distance(points)
 
-    def contact_group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _ContactGroup:
-        guided = _guided_share(shape, place) if main else jnp.zeros_like(gap)
-        return _ContactGroup(at, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
+    def contact_group(points: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _ContactGroup:
+        guided = _guided_share(shape, place) if is_main else jnp.zeros_like(gap)
+        return _ContactGroup(points, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
 
     groups = [contact_group(points, gap, normal, frame.along(rate), place)]
     corners = terrain.corners
     local = frame.within(corners)
     for gap, outward, rate, place in (
-        gaps_to_belt(belt, local), gaps_to_grousers(belt, drawn, local),
+        gaps_to_belt(belt, local), gaps_to_grousers(belt, belt_travel, local),
     ):  # fmt: skip
         normal = -frame.along(outward)
         points = corners + terrain.nose * -normal
@@ -179,19 +185,19 @@ def _belt_contacts(
 def _wheel_contacts(shape: ContactShape, terrain: Terrain, body: PartFrame) -> list[_ContactGroup]:
     """Contacts of the wheels with edges and corners of the ground."""
     a, b = terrain.points[:-1], terrain.points[1:]
-    along = b - a
-    length = jnp.sqrt(jnp.maximum(jnp.sum(along**2, axis=1), 1e-30))
-    normals = jnp.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None]
+    edges = b - a
+    length = jnp.sqrt(jnp.maximum(jnp.sum(edges**2, axis=1), 1e-30))
+    normals = jnp.stack([-edges[:, 1], edges[:, 0]], axis=1) / length[:, None]
     corners = terrain.corners
     groups = []
     for end in (1.0, -1.0):
         centre = body.world(jnp.stack([end * shape.half, jnp.zeros_like(shape.half)]))
-        share = jnp.sum((centre - a) * along, axis=1) / length**2
+        share = jnp.sum((centre - a) * edges, axis=1) / length**2
         to_edge = jnp.sum((centre - a) * normals, axis=1)
-        beside = (share >= 0) & (share <= 1) & (length > 1e-9) & (to_edge > 0)
+        is_beside = (share >= 0) & (share <= 1) & (length > 1e-9) & (to_edge > 0)
         arm = centre - corners
         to_corner = jnp.sqrt(jnp.sum(arm**2, axis=1))
-        gap = jnp.concatenate([jnp.where(beside, to_edge, FAR_OFF), to_corner]) - shape.wheel - terrain.nose
+        gap = jnp.concatenate([jnp.where(is_beside, to_edge, FAR_OFF), to_corner]) - shape.wheel - terrain.nose
         normal = jnp.concatenate([normals, arm / to_corner[:, None]])
         touch_points = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
         zeros = jnp.zeros_like(gap)
@@ -227,35 +233,42 @@ def contacts_with_terrain(shape: ContactShape, terrain: Terrain, q: Array, v: Ar
     groups += _wheel_contacts(shape, terrain, body)
     groups.append(_body_contacts(shape, terrain, body))
 
-    points, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
-    gap, guided, bears = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears"))
+    points, normal, rate = (
+        jnp.concatenate([getattr(g, name) for g in groups]) for name in ("points", "normal", "rate")
+    )
+    gap, guided, bears_load = (
+        jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears")
+    )
     rolls = np.concatenate([np.full(len(g.gap), g.rolls) for g in groups])
     along = running_direction(normal)
-    carried, own_loads = [], []
+    still_belt, moving_belt = [], []
     for direction in (normal, along):
         columns = [direction[:, 0], direction[:, 1], _speed_about_axle(direction, points - body.origin)]
         belt = jnp.sum(direction * rate, axis=1)
-        levers, with_belt = [], []
+        lever_columns, lever_belt_columns = [], []
         for lever in (front, rear):
-            on = np.concatenate([np.full(len(g.gap), g.turns == lever.turns) for g in groups])
-            turning_speed = jnp.where(on, -_speed_about_axle(direction, points - lever.origin), 0.0)
-            levers.append(turning_speed)
-            with_belt.append(turning_speed + jnp.where(on, belt, 0.0))
-        carried.append(jnp.stack([*columns, 0 * belt, *levers], axis=1))
-        own_loads.append(jnp.stack([*columns, belt, *with_belt], axis=1))
-    off, gear = own_loads[0], shape.gear
+            is_on_lever = np.concatenate([np.full(len(g.gap), g.turns == lever.turns) for g in groups])
+            turning_speed = jnp.where(is_on_lever, -_speed_about_axle(direction, points - lever.origin), 0.0)
+            lever_columns.append(turning_speed)
+            lever_belt_columns.append(turning_speed + jnp.where(is_on_lever, belt, 0.0))
+        still_belt.append(jnp.stack([*columns, 0 * belt, *lever_columns], axis=1))
+        moving_belt.append(jnp.stack([*columns, belt, *lever_belt_columns], axis=1))
+    off = moving_belt[0]
+    gear = shape.gear
     gap_rate = off @ v
     stiffness, exponent = gear.contact_stiffness, gear.contact_exponent
-    force = force_contact(gap, gap_rate, 0.0, stiffness, exponent, gear.contact_damping, gear.contact_depth) * bears
-    depth = jnp.where((gap < 0) & (bears > 0), -gap, 0.0)
+    force = (
+        force_contact(gap, gap_rate, 0.0, stiffness, exponent, gear.contact_damping, gear.contact_depth) * bears_load
+    )
+    depth = jnp.where((gap < 0) & (bears_load > 0), -gap, 0.0)
     elastic = stiffness * depth**exponent
     return Footing(
         gap=gap,
         gap_rate=gap_rate,
         normal=normal,
         off=off,
-        along=own_loads[1],
-        carried=carried[1],
+        along=moving_belt[1],
+        carried=still_belt[1],
         force=force,
         damped=jnp.asarray(damping_contact(force, gap, 0.0, gear.contact_damping, gear.contact_depth)),
         elastic=elastic,

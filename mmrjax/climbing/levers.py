@@ -66,11 +66,11 @@ class BeltLoop(eqx.Module):
         """Pitch of the grousers [m]."""
         return self.length / self.grousers
 
-    def normal(self, turned: Array) -> Float[Array, "n 2"]:
+    def normal(self, angle: Array) -> Float[Array, "n 2"]:
         """Outward normal where the belt has turned by this angle since its lower run [rad]."""
-        return jnp.stack([-jnp.sin(turned - self.taper), -jnp.cos(turned - self.taper)], axis=-1)
+        return jnp.stack([-jnp.sin(angle - self.taper), -jnp.cos(angle - self.taper)], axis=-1)
 
-    def turned(self, place: Array) -> Array:
+    def turning_angle(self, place: Array) -> Array:
         """Turning angle of the belt since its lower run [rad], at `place` [m]. Also defined beyond an
         end.
         """
@@ -79,22 +79,26 @@ class BeltLoop(eqx.Module):
 
     def tilt(self, place: Array) -> tuple[Array, Array]:
         """Tilt of a grouser on its rigid base [rad], the mean over the path below it, and its derivative [rad/m]."""
-        half = self.grouser_length / 2
+        half_base = self.grouser_length / 2
 
         def integral(s: Array) -> Array:
-            total = jnp.zeros_like(s)
+            turning_integral = jnp.zeros_like(s)
             for begin, end, radius in zip(self.marks[::2], self.marks[1::2], (self.first, self.second), strict=True):
                 length_inside = jnp.clip(s - begin, 0.0, end - begin)
-                total = total + (length_inside**2 / 2 + (end - begin) * jnp.maximum(s - end, 0.0)) / radius
-            return total
+                turning_integral = (
+                    turning_integral + (length_inside**2 / 2 + (end - begin) * jnp.maximum(s - end, 0.0)) / radius
+                )
+            return turning_integral
 
-        mean = (integral(place + half) - integral(place - half)) / self.grouser_length
-        return mean, (self.turned(place + half) - self.turned(place - half)) / self.grouser_length
+        mean = (integral(place + half_base) - integral(place - half_base)) / self.grouser_length
+        return mean, (
+            self.turning_angle(place + half_base) - self.turning_angle(place - half_base)
+        ) / self.grouser_length
 
     def point(self, place: Array) -> Float[Array, "n 2"]:
         """Points of the pitch line [m], at positions `place` from 0 to the length of the belt."""
         a, b, c, d = self.marks
-        normal = self.normal(self.turned(place))
+        normal = self.normal(self.turning_angle(place))
         on_first_pulley = place < (b + c) / 2
         on_first_pulley = on_first_pulley & (place > -self.run)
         along = jnp.where(
@@ -106,30 +110,32 @@ class BeltLoop(eqx.Module):
         centre = jnp.stack([jnp.where(on_first_pulley, 0.0, self.distance), jnp.zeros_like(place)], axis=-1)
         return centre + radius[..., None] * normal + along[..., None] * running_direction(normal)
 
-    def places(self, drawn: Scalar) -> Float[Array, " grousers"]:
-        """Positions of the grousers after the belt has moved by `drawn` [m]."""
-        return jnp.mod(jnp.arange(self.grousers) * self.pitch + drawn, self.length)
+    def places(self, belt_travel: Scalar) -> Float[Array, " grousers"]:
+        """Positions of the grousers after the belt has moved by `belt_travel` [m]."""
+        return jnp.mod(jnp.arange(self.grousers) * self.pitch + belt_travel, self.length)
 
-    def project(self, at: Float[Array, "n 2"]) -> tuple[Array, Array]:
+    def project(self, points: Float[Array, "n 2"]) -> tuple[Array, Array]:
         """Height of points above the pitch line [m], negative inside the belt, and the position on the path below
         them [m].
         """
         a, b, c, _ = self.marks
         sin, cos = jnp.sin(self.taper), jnp.cos(self.taper)
-        upper = at[..., 1] > 0
-        beside = jnp.abs(at[..., 1])
-        along = at[..., 0] * cos - beside * sin
-        from_second = at - jnp.stack([self.distance, jnp.zeros_like(self.distance)])
+        upper = points[..., 1] > 0
+        axis_distance = jnp.abs(points[..., 1])
+        along = points[..., 0] * cos - axis_distance * sin
+        from_second = points - jnp.stack([self.distance, jnp.zeros_like(self.distance)])
         on_first, on_second = along < 0, along > self.run
         height = jnp.where(
             on_first,
-            _norm(at) - self.first,
-            jnp.where(on_second, _norm(from_second) - self.second, at[..., 0] * sin + beside * cos - self.first),
+            _norm(points) - self.first,
+            jnp.where(
+                on_second, _norm(from_second) - self.second, points[..., 0] * sin + axis_distance * cos - self.first
+            ),
         )
         straight = jnp.where(upper, b + along, jnp.mod(a - along, self.length))
         place = jnp.where(
             on_first,
-            a + self.first * self._angle_of_normal(at),
+            a + self.first * self._angle_of_normal(points),
             jnp.where(
                 on_second, c + self.second * (self._angle_of_normal(from_second) - jnp.pi - 2 * self.taper), straight
             ),
@@ -144,40 +150,42 @@ class BeltLoop(eqx.Module):
 def grouser_tips(loop: BeltLoop, place: Float[Array, " n"]) -> tuple[Array, Array]:
     """Tips of the grousers at `place` [m along the path], and their displacement per displacement of the belt [-].
 
-    Both have the shape (n, 2). Their rigid bases: see `belt.tips_on_path`.
+    Both have the shape (n, 2). Their rigid bases: see `running_gear.tips_on_path`.
     """
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     height = loop.grouser_height
-    run = running_direction(loop.normal(loop.turned(place)))
+    run = running_direction(loop.normal(loop.turning_angle(place)))
     return loop.point(place) + height * normal, run + height * rise[:, None] * running_direction(normal)
 
 
-def gaps_to_belt(loop: BeltLoop, at: Float[Array, "n 2"]) -> tuple[Array, Array, Array, Array]:
+def gaps_to_belt(loop: BeltLoop, points: Float[Array, "n 2"]) -> tuple[Array, Array, Array, Array]:
     """Gaps between points, such as corners of the ground, and the belt between its grousers.
 
     Returns:
         Distance from the belt [m], its outward normal, shape (n, 2), displacement of its material per displacement of
         the belt, shape (n, 2), and position on the path [m].
     """
-    height, place = loop.project(at)
-    normal = loop.normal(loop.turned(place))
+    height, place = loop.project(points)
+    normal = loop.normal(loop.turning_angle(place))
     return height, normal, running_direction(normal), place
 
 
-def gaps_to_grousers(loop: BeltLoop, drawn: Scalar, at: Float[Array, "n 2"]) -> tuple[Array, Array, Array, Array]:
+def gaps_to_grousers(
+    loop: BeltLoop, belt_travel: Scalar, points: Float[Array, "n 2"]
+) -> tuple[Array, Array, Array, Array]:
     """As `gaps_to_belt`, to the nearest grouser, a rigid tooth with flanks perpendicular to its base."""
-    under = loop.project(at)[1]
-    grouser_offset = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
-    place = jnp.mod(under - grouser_offset, loop.length)
+    place_below = loop.project(points)[1]
+    grouser_offset = jnp.mod(place_below - belt_travel + loop.pitch / 2, loop.pitch) - loop.pitch / 2
+    place = jnp.mod(place_below - grouser_offset, loop.length)
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     along = running_direction(normal)
-    arm = at - loop.point(place)
+    arm = points - loop.point(place)
     u, w = jnp.sum(arm * along, axis=-1), jnp.sum(arm * normal, axis=-1)
     flank, top = jnp.abs(u) - loop.grouser_length / 2, w - loop.grouser_height
     outward = jnp.where((flank > top)[:, None], jnp.sign(u)[:, None] * along, normal)
-    run = running_direction(loop.normal(loop.turned(place)))
+    run = running_direction(loop.normal(loop.turning_angle(place)))
     rate = run + rise[:, None] * (w[:, None] * along - u[:, None] * normal)
     return jnp.maximum(flank, top), outward, rate, place
 
@@ -191,8 +199,8 @@ def _norm(vector: Array) -> Array:
     return jnp.sqrt(jnp.sum(vector**2, axis=-1) + 1e-300)
 
 
-#: Pieces of a drive's law: the voltage is at its minimum (-1), its maximum (1), or follows from the demanded rate
-#: (0); direction of motion of the levers, 0 at rest; sign of T in motion.
+#: Pieces of a drive's law. First column: the voltage is at its minimum (-1), its maximum (1), or follows from the
+#: demanded rate (0). Second: direction of motion of the levers, 0 at rest. Third: sign of T in motion.
 _PIECES = np.array([
     (0, 0, 0),
     *((end, way, sign) for end in (-1, 1) for way, sign in ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))),
@@ -231,7 +239,7 @@ class LeverDrive(eqx.Module):
     back: Scalar
     current_limit: Scalar
 
-    def against(self, torque: Scalar, direction: float) -> Scalar:
+    def motor_side_torque(self, torque: Scalar, direction: float) -> Scalar:
         """Torque c T [N·m] that the motor side must supply for a torque T on levers that move up (`direction` 1) or
         down (-1).
         """
@@ -240,7 +248,8 @@ class LeverDrive(eqx.Module):
 
 def lever_drive(robot: Robot) -> LeverDrive:
     """Drive of a pair of levers: the motor with both gears."""
-    levers, motor = robot.running_gear.levers, robot.motor
+    levers = robot.running_gear.levers
+    motor = robot.motor
     ratio = levers.worm_ratio * levers.planetary_ratio
     planetary = Gearbox(efficiency_load=levers.planetary_efficiency, mesh_theory=True).efficiency_backward
     worm = 2 - 1 / levers.worm_efficiency
@@ -278,81 +287,96 @@ def step_levers(
     step: Scalar,
     rate: Pair,
     free: Pair,
-    yields: Float[Array, "2 2"],
-    asked: Pair,
+    rate_per_torque: Float[Array, "2 2"],
+    demanded: Pair,
     least: Pair,
     most: Pair,
 ) -> LeverStep:
     """One time step of both lever pairs: the demanded rates if the voltages suffice, otherwise the rates that the
     voltages give.
 
-    The levers' mechanics give ω = free + yields T after the step. The voltage is chosen between `least` and `most` so
-    that ω is the demanded rate. For a lever that has to stand, the smallest voltage that holds it. Each drive's law
-    has straight pieces (`_PIECES`). Of all pairs of pieces the one whose solution is on both is taken, or the one
-    with the smallest deviation. This is exact and has no iterations. A root finder cannot replace it: where a lever
-    stands, its law allows a range of torques and is no function.
+    The levers' mechanics give ω = free + rate_per_torque · T after the step. The voltage is chosen between `least`
+    and `most` so that ω is the demanded rate. For a lever that has to stand, it is the smallest voltage that holds
+    it. Each drive's law has straight pieces (`_PIECES`). Of all pairs of pieces the one with the smallest deviation
+    is used, 0 if the solution is on both. This is exact and has no iterations. A root finder cannot replace it: if a
+    lever stands, its law allows a range of torques and is no function.
 
     Args:
         step: time step [s].
         rate: angular speed before the step [rad/s].
         free: angular speed after the step without drive torque [rad/s].
-        yields: change of the angular speed per drive torque [rad/(N·m·s)].
-        asked: demanded angular speeds after the step [rad/s].
+        rate_per_torque: change of the angular speed per drive torque [rad/(N·m·s)].
+        demanded: demanded angular speeds after the step [rad/s].
         least, most: limits of the motor voltages [V].
     """
-    limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
-    least, most = jnp.maximum(least, limits[0]), jnp.minimum(most, limits[1])
+    current_limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
+    least, most = jnp.maximum(least, current_limits[0]), jnp.minimum(most, current_limits[1])
     inertia_rate = drive.inertia * (1 / step)
-    stiff = inertia_rate + drive.constant**2 / drive.resistance + drive.viscous
+    torque_per_rate = inertia_rate + drive.constant**2 / drive.resistance + drive.viscous
 
-    end, way, sign = _PIECES.T
-    moves, follows = way != 0, end == 0
-    pushed = drive.constant / drive.resistance * jnp.where(end > 0, most[:, None], least[:, None])
+    end, direction, sign = _PIECES.T
+    is_moving, is_following = direction != 0, end == 0
+    stall_torque = drive.constant / drive.resistance * jnp.where(end > 0, most[:, None], least[:, None])
     # α T + β ω = γ on a piece, (pairs, pieces)
-    alpha = jnp.where(moves, jnp.where(sign * way > 0, drive.ahead, drive.back), 0.0) + 0 * pushed
-    beta = jnp.where(moves, stiff, 1.0) + 0 * pushed
-    gamma = jnp.where(moves, pushed + inertia_rate * rate[:, None] - way * drive.dry, follows * asked[:, None])
+    alpha = jnp.where(is_moving, jnp.where(sign * direction > 0, drive.ahead, drive.back), 0.0) + 0 * stall_torque
+    beta = jnp.where(is_moving, torque_per_rate, 1.0) + 0 * stall_torque
+    gamma = jnp.where(
+        is_moving,
+        stall_torque + inertia_rate * rate[:, None] - direction * drive.dry,
+        is_following * demanded[:, None],
+    )
 
-    (a, b), (c, d) = beta[:, None] * yields[:, :, None]
+    (a, b), (c, d) = beta[:, None] * rate_per_torque[:, :, None]
     a, d = (a + alpha[0])[:, None], (d + alpha[1])[None]
     b, c = b[:, None], c[None]
     r, s = ((gamma - beta * free[:, None])[k] for k in range(2))
     r, s = r[:, None], s[None]
-    size = a * d - b * c
-    torque = jnp.stack([(d * r - b * s) / size, (a * s - c * r) / size])
-    lever_rates = free[:, None, None] + jnp.einsum("ij,jkl->ikl", yields, torque)
+    determinant = a * d - b * c
+    torque = jnp.stack([(d * r - b * s) / determinant, (a * s - c * r) / determinant])
+    lever_rates = free[:, None, None] + jnp.einsum("ij,jkl->ikl", rate_per_torque, torque)
 
-    def candidate_solutions(k: int, ways: tuple[slice | None, ...]) -> tuple[Array, Array, Array, Array]:
+    def candidate_solutions(k: int, axes: tuple[slice | None, ...]) -> tuple[Array, Array, Array, Array]:
         """Distance of each candidate solution from its piece of the law of lever pair `k` (0: on it) [N·m]. Then i
         C_m I of the motor within the voltage limits [N·m], load torque [N·m] and speed [rad/s]."""
         force, speed = torque[k], lever_rates[k]
-        turning = inertia_rate * (speed - rate[k]) + drive.viscous * speed
-        up, down = drive.against(force, 1.0) + drive.dry + turning, drive.against(force, -1.0) - drive.dry + turning
-        low, high = jnp.where(asked[k] > 0, up, down), jnp.where(asked[k] < 0, down, up)
-        weak, strong = (drive.constant / drive.resistance * (x[k] - drive.constant * speed) for x in (least, most))
-        on = pushed[k][ways]
-        beyond = end[ways] * (speed - asked[k]) * stiff
-        standing_excess = jnp.maximum(on - up, down - on)
-        goes = jnp.maximum(-way[ways] * speed * stiff, -sign[ways] * force)
-        off = jnp.where(
-            follows[ways],
-            jnp.maximum(low - strong, weak - high),
-            jnp.maximum(jnp.where(moves[ways], goes, standing_excess), beyond),
+        acceleration_torque = inertia_rate * (speed - rate[k]) + drive.viscous * speed
+        up, down = (
+            drive.motor_side_torque(force, 1.0) + drive.dry + acceleration_torque,
+            drive.motor_side_torque(force, -1.0) - drive.dry + acceleration_torque,
         )
-        return jnp.maximum(off, 0.0), jnp.clip(jnp.clip(0.0, low, high), weak, strong), force, speed
+        low, high = jnp.where(demanded[k] > 0, up, down), jnp.where(demanded[k] < 0, down, up)
+        torque_least, torque_most = (
+            drive.constant / drive.resistance * (x[k] - drive.constant * speed) for x in (least, most)
+        )
+        stall = stall_torque[k][axes]
+        rate_excess = end[axes] * (speed - demanded[k]) * torque_per_rate
+        standing_excess = jnp.maximum(stall - up, down - stall)
+        motion_error = jnp.maximum(-direction[axes] * speed * torque_per_rate, -sign[axes] * force)
+        deviation = jnp.where(
+            is_following[axes],
+            jnp.maximum(low - torque_most, torque_least - high),
+            jnp.maximum(jnp.where(is_moving[axes], motion_error, standing_excess), rate_excess),
+        )
+        return (
+            jnp.maximum(deviation, 0.0),
+            jnp.clip(jnp.clip(0.0, low, high), torque_least, torque_most),
+            force,
+            speed,
+        )
 
     candidates = candidate_solutions(0, (slice(None), None)), candidate_solutions(1, (None, slice(None)))
-    off = jnp.nan_to_num(jnp.maximum(candidates[0][0], candidates[1][0]), nan=jnp.inf, posinf=jnp.inf)
-    best = jnp.unravel_index(jnp.argmin(off), off.shape)
-    best_pair, motor_torques = jnp.stack(best), jnp.stack([pair[1][best] for pair in candidates])
-    torque, after = torque[:, *best], lever_rates[:, *best]
-    fixed = jnp.where(jnp.asarray(end)[best_pair] > 0, most, least)
-    stands = jnp.where(jnp.asarray(follows)[best_pair], asked == 0, ~jnp.asarray(moves)[best_pair])
-    after = jnp.where(stands, 0.0, after)
+    deviation = jnp.nan_to_num(jnp.maximum(candidates[0][0], candidates[1][0]), nan=jnp.inf, posinf=jnp.inf)
+    best = jnp.unravel_index(jnp.argmin(deviation), deviation.shape)
+    best_pair = jnp.stack(best)
+    motor_torques = jnp.stack([pair[1][best] for pair in candidates])
+    torque, rate_after = torque[:, *best], lever_rates[:, *best]
+    limit_voltage = jnp.where(jnp.asarray(end)[best_pair] > 0, most, least)
+    is_standing = jnp.where(jnp.asarray(is_following)[best_pair], demanded == 0, ~jnp.asarray(is_moving)[best_pair])
+    rate_after = jnp.where(is_standing, 0.0, rate_after)
     voltage = jnp.where(
-        jnp.asarray(follows)[best_pair],
-        drive.resistance / drive.constant * motor_torques + drive.constant * after,
-        fixed,
+        jnp.asarray(is_following)[best_pair],
+        drive.resistance / drive.constant * motor_torques + drive.constant * rate_after,
+        limit_voltage,
     )
-    current = (voltage - drive.constant * after) / drive.resistance
-    return LeverStep(torque, after, voltage, current, stands & (jnp.abs(current) < _NONE))
+    current = (voltage - drive.constant * rate_after) / drive.resistance
+    return LeverStep(torque, rate_after, voltage, current, is_standing & (jnp.abs(current) < _NONE))

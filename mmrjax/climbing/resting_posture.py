@@ -60,8 +60,8 @@ class SideOutline(eqx.Module):
     def with_pitch(self, pitch: Scalar) -> SideOutline:
         """Same outline with its nose raised by `pitch` [rad], about the middle of the wheelbase."""
         forward, up = rotate_to_ground(self.forward, self.up, jnp.asarray(pitch)[..., None])
-        at, high = rotate_to_ground(self.centre_forward, self.centre_up, pitch)
-        return dataclasses.replace(self, forward=forward, up=up, centre_forward=at, centre_up=high)
+        centre_forward, centre_up = rotate_to_ground(self.centre_forward, self.centre_up, pitch)
+        return dataclasses.replace(self, forward=forward, up=up, centre_forward=centre_forward, centre_up=centre_up)
 
     @property
     def length(self) -> Scalar:
@@ -98,20 +98,29 @@ def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = Non
     Args:
         mass: total mass with payload [kg]. None: as stated.
     """
-    chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
+    chassis = robot.chassis(conditions.configuration)
+    gear = robot.running_gear
     tracked = jnp.asarray(chassis.on_tracks)
-    ahead, high = posture_masses(robot, conditions, mass).centre
+    centre_forward, centre_up = posture_masses(robot, conditions, mass).centre
     front, rear = masses.lever_angles(gear, conditions)
-    half, reach = gear.wheelbase / 2, gear.lever_length * tracked
-    axle, roller = chassis.radius + tracked * gear.grouser_height, gear.levers.roller * tracked
-    zeros = jnp.zeros_like(half)
-    corners = [-half - reach * jnp.cos(rear), -half, half, half + reach * jnp.cos(front)]
-    corner_heights = [reach * jnp.sin(rear), zeros, zeros, reach * jnp.sin(front)]
+    half_wheelbase = gear.wheelbase / 2
+    lever_length = gear.lever_length * tracked
+    axle_radius, roller_radius = chassis.radius + tracked * gear.grouser_height, gear.levers.roller * tracked
+    zeros = jnp.zeros_like(half_wheelbase)
+    circles_forward = [
+        -half_wheelbase - lever_length * jnp.cos(rear),
+        -half_wheelbase,
+        half_wheelbase,
+        half_wheelbase + lever_length * jnp.cos(front),
+    ]
+    circles_up = [lever_length * jnp.sin(rear), zeros, zeros, lever_length * jnp.sin(front)]
     forward, up, radius = (
         jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(x) for x in row)), -1)
-        for row in (corners, corner_heights, [roller, axle, axle, roller])
+        for row in (circles_forward, circles_up, [roller_radius, axle_radius, axle_radius, roller_radius])
     )
-    return SideOutline(forward, up, radius, robot.radius_pulley + gear.grouser_height, tracked, ahead, high)
+    return SideOutline(
+        forward, up, radius, robot.radius_pulley + gear.grouser_height, tracked, centre_forward, centre_up
+    )
 
 
 class Posture(eqx.Module):
@@ -178,41 +187,41 @@ def rest_on_slope(side: SideOutline, slope: Scalar, inertia: Scalar) -> Posture:
     """Posture of an outline at rest on a slope [rad], see `posture`."""
     tail, nose = EDGES.T
     ahead, rise = side.forward[nose] - side.forward[tail], side.up[nose] - side.up[tail]
-    apart = jnp.sqrt(jnp.maximum(ahead**2 + rise**2, 1e-12))
-    ratio = (side.radius[nose] - side.radius[tail]) / apart
-    tangent = jnp.abs(ratio) < 1
-    pitch = jnp.arcsin(jnp.where(tangent, ratio, 0.0)) - jnp.arctan2(rise, jnp.where(apart > 1e-6, ahead, 1.0))
+    distance = jnp.sqrt(jnp.maximum(ahead**2 + rise**2, 1e-12))
+    ratio = (side.radius[nose] - side.radius[tail]) / distance
+    has_tangent = jnp.abs(ratio) < 1
+    pitch = jnp.arcsin(jnp.where(has_tangent, ratio, 0.0)) - jnp.arctan2(rise, jnp.where(distance > 1e-6, ahead, 1.0))
     pitch = jnp.arctan2(jnp.sin(pitch), jnp.cos(pitch))
     rotated = side.with_pitch(pitch)
-    low = rotated.up - rotated.radius  # (edges, circles)
-    edge_numbers = np.arange(len(EDGES))
-    gaps = low - low[edge_numbers, tail][:, None]
-    rear, front = rotated.forward[edge_numbers, tail], rotated.forward[edge_numbers, nose]
-    high = jnp.asarray(rotated.centre_up) - low[edge_numbers, tail]
+    bottoms = rotated.up - rotated.radius  # (edges, circles)
+    edges = np.arange(len(EDGES))
+    gaps = bottoms - bottoms[edges, tail][:, None]
+    rear, front = rotated.forward[edges, tail], rotated.forward[edges, nose]
+    centre_height = jnp.asarray(rotated.centre_up) - bottoms[edges, tail]
     centre = jnp.asarray(rotated.centre_forward)
-    foot = centre - high * jnp.tan(slope)
+    foot = centre - centre_height * jnp.tan(slope)
     margin = jnp.minimum(foot - rear, front - foot)
 
-    upright = jnp.abs(pitch) < UPRIGHT
-    lowest = upright & tangent & (apart > 1e-6) & (jnp.min(gaps, -1) > -_ROUNDING)
+    is_upright = jnp.abs(pitch) < UPRIGHT
+    is_possible = is_upright & has_tangent & (distance > 1e-6) & (jnp.min(gaps, -1) > -_ROUNDING)
     # Circles on one line give several edges of equal pitch: the longest is the contact.
     rank = jnp.where(margin >= 0, jnp.abs(pitch) - 1e-3 * (front - rear), 10 - margin)
-    best = jnp.argmin(jnp.where(lowest, rank, jnp.inf))
+    best = jnp.argmin(jnp.where(is_possible, rank, jnp.inf))
 
-    touching = gaps[best] < TOUCH
-    between = (np.arange(4) >= np.minimum(tail, nose)[:, None]) & (np.arange(4) <= np.maximum(tail, nose)[:, None])
-    line = jnp.all(touching | ~jnp.asarray(between)[best]) * side.tracked
+    is_touching = gaps[best] < TOUCH
+    is_between = (np.arange(4) >= np.minimum(tail, nose)[:, None]) & (np.arange(4) <= np.maximum(tail, nose)[:, None])
+    line = jnp.all(is_touching | ~jnp.asarray(is_between)[best]) * side.tracked
     return Posture(
         pitch=pitch[best],
-        height=-low[best, jnp.asarray(tail)[best]],
+        height=-bottoms[best, jnp.asarray(tail)[best]],
         rear=rear[best],
         front=front[best],
         line=line,
         centre_ahead=centre[best],
-        centre_height=high[best],
+        centre_height=centre_height[best],
         load_front=((foot - rear) / (front - rear))[best],
         margin=margin[best],
-        tips_back=jnp.arctan2(centre - rear, high)[best],
-        tips_forward=jnp.arctan2(front - centre, high)[best],
+        tips_back=jnp.arctan2(centre - rear, centre_height)[best],
+        tips_forward=jnp.arctan2(front - centre, centre_height)[best],
         inertia=inertia,
     )

@@ -72,23 +72,26 @@ def lowest_points(side: SideOutline) -> tuple[Scalar, Scalar]:
     """Heights of the lowest points of an outline behind its centre of mass and ahead of it [m]."""
     line = side.centre_forward
     # circles: the bottom if it is on that side, else the intersection of the line with the arc
-    apart, radius = side.forward - line, side.radius
-    cut = jnp.where(jnp.abs(apart) < radius, jnp.sqrt(jnp.maximum(radius**2 - apart**2, 1e-18)), -jnp.inf)
-    ahead = side.up - jnp.where(apart >= 0, radius, cut)
-    behind = side.up - jnp.where(apart <= 0, radius, cut)
+    offset = side.forward - line
+    radius = side.radius
+    arc_height = jnp.where(jnp.abs(offset) < radius, jnp.sqrt(jnp.maximum(radius**2 - offset**2, 1e-18)), -jnp.inf)
+    ahead = side.up - jnp.where(offset >= 0, radius, arc_height)
+    behind = side.up - jnp.where(offset <= 0, radius, arc_height)
 
     # belts: intersection of the line with a straight run, both of each, as either may be the lower one
-    one, other = np.array([*BELTS, *(pair[::-1] for pair in BELTS)]).T
-    around = jnp.where(np.array([True, False, False, True]), radius, side.belt)
-    along, rise = side.forward[other] - side.forward[one], side.up[other] - side.up[one]
-    apart = jnp.sqrt(jnp.maximum(along**2 + rise**2, 1e-12))
-    ratio = (around[other] - around[one]) / apart
-    runs = (jnp.abs(ratio) < 1) & (apart > 1e-6)
-    direction = jnp.arctan2(rise, jnp.where(runs, along, 1.0)) - jnp.arcsin(jnp.where(runs, ratio, 0.0))
+    first, second = np.array([*BELTS, *(pair[::-1] for pair in BELTS)]).T
+    belt_radius = jnp.where(np.array([True, False, False, True]), radius, side.belt)
+    distance_forward, rise = side.forward[second] - side.forward[first], side.up[second] - side.up[first]
+    distance = jnp.sqrt(jnp.maximum(distance_forward**2 + rise**2, 1e-12))
+    ratio = (belt_radius[second] - belt_radius[first]) / distance
+    has_run = (jnp.abs(ratio) < 1) & (distance > 1e-6)
+    direction = jnp.arctan2(rise, jnp.where(has_run, distance_forward, 1.0)) - jnp.arcsin(
+        jnp.where(has_run, ratio, 0.0)
+    )
     sine, cosine = jnp.sin(direction), jnp.cos(direction)
-    (x0, x1) = (side.forward[k] + around[k] * sine for k in (one, other))
-    (z0, z1) = (side.up[k] - around[k] * cosine for k in (one, other))
-    crosses = runs & ((x0 - line) * (x1 - line) <= 0) & (jnp.abs(x1 - x0) > 1e-9)
+    (x0, x1) = (side.forward[k] + belt_radius[k] * sine for k in (first, second))
+    (z0, z1) = (side.up[k] - belt_radius[k] * cosine for k in (first, second))
+    crosses = has_run & ((x0 - line) * (x1 - line) <= 0) & (jnp.abs(x1 - x0) > 1e-9)
     share = (line - x0) / jnp.where(crosses, x1 - x0, 1.0)
     belt = jnp.min(jnp.where(crosses, z0 + share * (z1 - z0), jnp.inf))
     return jnp.minimum(jnp.min(behind), belt), jnp.minimum(jnp.min(ahead), belt)
@@ -98,8 +101,8 @@ def step_height_at(side: SideOutline, pitch: Scalar) -> Scalar:
     """Height of the step on which an outline rests at a pitch with its centre of mass above the edge [m].
 
     The lowest point behind the centre of mass stands on the lower ground, the lowest point ahead of it on the step.
-    So H = min over x ≥ x_c of z less min over x ≤ x_c of z. Let only belt and pulley touch, with the tail turning on
-    a circle of radius R, the centre of mass ℓ ahead of its centre and h above the axles,
+    So H = min over x ≥ x_c of z less min over x ≤ x_c of z. If only belt and pulley touch, the tail turns on a circle
+    of radius R. With the centre of mass ℓ ahead of its centre and h above the axles,
 
         H = R (1 - cos θ) + (ℓ - (h + R) tan θ) sin θ.
     """
@@ -108,18 +111,19 @@ def step_height_at(side: SideOutline, pitch: Scalar) -> Scalar:
 
 
 def _pitch_of_highest_step(
-    height: Callable[[Scalar], Scalar], count: int, near: int, rounds: int
+    height: Callable[[Scalar], Scalar], count: int, refined_count: int, rounds: int
 ) -> tuple[Scalar, Scalar]:
     """Pitch of the highest step and its resolution [rad], from `count` pitches, refined `rounds` times around
-    `near`.
+    `refined_count`.
     """
-    apart = jnp.pi / 2 / (count - 1)
+    resolution = jnp.pi / 2 / (count - 1)
     grid = jnp.linspace(0.0, jnp.pi / 2, count)
     best = grid[jnp.argmax(jax.vmap(height)(grid))]
     for _ in range(rounds):
-        grid = jnp.clip(best + apart * jnp.linspace(-1.0, 1.0, near), 0.0, jnp.pi / 2)
-        best, apart = grid[jnp.argmax(jax.vmap(height)(grid))], apart * 2 / (near - 1)
-    return best, apart
+        grid = jnp.clip(best + resolution * jnp.linspace(-1.0, 1.0, refined_count), 0.0, jnp.pi / 2)
+        best = grid[jnp.argmax(jax.vmap(height)(grid))]
+        resolution = resolution * 2 / (refined_count - 1)
+    return best, resolution
 
 
 def find_highest_step(side: SideOutline, pitch: Scalar | None = None) -> StepLimit:
@@ -138,8 +142,8 @@ def find_highest_step(side: SideOutline, pitch: Scalar | None = None) -> StepLim
         else pitch
     )
     neighbours = best + jnp.array([-_BESIDE, _BESIDE])
-    rises = jax.vmap(lambda pitch: value_and_slope(lambda x: step_height_at(constant_side, x), pitch)[1])(neighbours)
-    share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
+    slopes = jax.vmap(lambda pitch: value_and_slope(lambda x: step_height_at(constant_side, x), pitch)[1])(neighbours)
+    share = jnp.clip(-slopes[1] / jnp.maximum(slopes[0] - slopes[1], 1e-12), 0.0, 1.0)
     height_change = jnp.asarray(
         jax.vmap(lambda pitch: step_height_at(side, pitch) - step_height_at(constant_side, pitch))(neighbours)
     )
@@ -171,8 +175,9 @@ def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Sc
     They would be upright without their mass, a share μ of the total with its centre c from their axle, which favours
     a position further ahead. Both angles are limited to the levers' range.
     """
-    gear, half = robot.running_gear, resting_posture.posture_masses(robot, conditions)
-    lever_moment_share = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
+    gear = robot.running_gear
+    half_masses = resting_posture.posture_masses(robot, conditions)
+    lever_moment_share = gear.lever_mass * gear.lever_centre / (half_masses.chassis + 2 * half_masses.pulley)
     rear = pitch - jnp.pi / 2 - jnp.arctan2(lever_moment_share * jnp.sin(pitch), gear.lever_length * jnp.cos(pitch))
     least, most = gear.levers.angle_least, gear.levers.angle_most
     return jnp.clip(-pitch, least, most), jnp.clip(rear, least, most)
@@ -185,23 +190,30 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[StepLimit, Scalar, 
     riser carries no load. When the tail leaves the lower ground, the centre of mass must be over the step, and no
     posture allows a higher step then. Only the pitch is searched. The levers' angles follow from it (`best_levers`).
     """
-    still, run = jax.lax.stop_gradient((robot, conditions))
+    constant_robot, constant_conditions = jax.lax.stop_gradient((robot, conditions))
 
     def height(pitch: Scalar) -> Scalar:
         return step_height_at(
-            resting_posture.side_outline(still, with_lever_angles(run, *best_levers(still, run, pitch))), pitch
+            resting_posture.side_outline(
+                constant_robot,
+                with_lever_angles(constant_conditions, *best_levers(constant_robot, constant_conditions, pitch)),
+            ),
+            pitch,
         )
 
-    best, apart = _pitch_of_highest_step(height, *_POSTURES)
+    best, resolution = _pitch_of_highest_step(height, *_POSTURES)
     for _ in range(2):  # smooth here: vertices of parabolas
-        low, middle, high = jnp.asarray(jax.vmap(height)(best + apart * jnp.array([-1.0, 0.0, 1.0])))
-        bend = 2 * middle - low - high
+        low, middle, high = jnp.asarray(jax.vmap(height)(best + resolution * jnp.array([-1.0, 0.0, 1.0])))
+        curvature = 2 * middle - low - high
         best = (
             best
-            + jnp.where(bend > 0, jnp.clip((high - low) / (2 * jnp.where(bend > 0, bend, 1.0)), -1, 1), 0.0) * apart
+            + jnp.where(
+                curvature > 0, jnp.clip((high - low) / (2 * jnp.where(curvature > 0, curvature, 1.0)), -1, 1), 0.0
+            )
+            * resolution
         )
-        apart = apart / 16
-    front, rear = best_levers(still, run, best)
+        resolution = resolution / 16
+    front, rear = best_levers(constant_robot, constant_conditions, best)
     return (
         find_highest_step(resting_posture.side_outline(robot, with_lever_angles(conditions, front, rear)), best),
         front,
@@ -219,34 +231,36 @@ def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: S
     apart. Grousers that catch a nose hold more, and a robot that rocks may still climb.
     """
     angle = flush_lever_angle(robot)
-    rests = resting_posture.level_posture(robot, with_lever_angles(conditions, angle, angle))
-    tail, nose = rests.centre_ahead - rests.rear, rests.front - rests.centre_ahead
+    posture = resting_posture.level_posture(robot, with_lever_angles(conditions, angle, angle))
+    tail, nose = posture.centre_ahead - posture.rear, posture.front - posture.centre_ahead
     # ℓ cos α - h sin α = t
-    reach = jnp.sqrt(tail**2 + rests.centre_height**2)
-    rocks = jnp.arccos(jnp.clip(tread / reach, 0.0, 1.0 - 1e-12)) - jnp.arctan2(rests.centre_height, tail)
-    bridged = jnp.minimum(tail, nose) >= tread
-    steepest = jnp.minimum(jnp.arctan(friction), jnp.maximum(rocks, 0.0))
-    return jnp.where(bridged, tread * jnp.tan(steepest), 0.0) * rests.line
+    reach = jnp.sqrt(tail**2 + posture.centre_height**2)
+    rocking_angle = jnp.arccos(jnp.clip(tread / reach, 0.0, 1.0 - 1e-12)) - jnp.arctan2(posture.centre_height, tail)
+    is_bridged = jnp.minimum(tail, nose) >= tread
+    steepest = jnp.minimum(jnp.arctan(friction), jnp.maximum(rocking_angle, 0.0))
+    return jnp.where(is_bridged, tread * jnp.tan(steepest), 0.0) * posture.line
 
 
 def posture_limits(robot: Robot, conditions: Conditions) -> StaticLimits:
     """Static limits of a robot on level ground, for one run, including the slopes at which it tips."""
-    side, rests = resting_posture.side_outline(robot, conditions), resting_posture.level_posture(robot, conditions)
-    highest, lies = find_highest_step(side), side.with_pitch(rests.pitch)
-    tops, tracked = lies.up + lies.radius + rests.height, jnp.asarray(side.tracked) > 0.5
-    bridged: Scalar = jnp.minimum(rests.front - rests.centre_ahead, rests.centre_ahead - rests.rear)
+    side, posture = resting_posture.side_outline(robot, conditions), resting_posture.level_posture(robot, conditions)
+    highest = find_highest_step(side)
+    level_side = side.with_pitch(posture.pitch)
+    tops = level_side.up + level_side.radius + posture.height
+    on_tracks = jnp.asarray(side.tracked) > 0.5
+    half_gap: Scalar = jnp.minimum(posture.front - posture.centre_ahead, posture.centre_ahead - posture.rear)
     width = robot.chassis(conditions.configuration).turning.width
     return StaticLimits(
         step=highest.height,
-        gap=jnp.maximum(bridged, 0.0) * rests.line,
-        contact=rests.length,
-        tip_front=jnp.where(tracked, tops[FRONT_ROLLER], jnp.max(tops)),
-        tip_rear=jnp.where(tracked, tops[REAR_ROLLER], jnp.max(tops)),
-        tips_back=rests.tips_back,
-        tips_forward=rests.tips_forward,
-        tips_aside=jnp.arctan2(width / 2, rests.centre_height),
-        length=lies.length,
-        height=lies.height,
+        gap=jnp.maximum(half_gap, 0.0) * posture.line,
+        contact=posture.length,
+        tip_front=jnp.where(on_tracks, tops[FRONT_ROLLER], jnp.max(tops)),
+        tip_rear=jnp.where(on_tracks, tops[REAR_ROLLER], jnp.max(tops)),
+        tips_back=posture.tips_back,
+        tips_forward=posture.tips_forward,
+        tips_aside=jnp.arctan2(width / 2, posture.centre_height),
+        length=level_side.length,
+        height=level_side.height,
     )
 
 
@@ -257,8 +271,8 @@ def postures_of_runs(robot: Robot, conditions: Conditions) -> tuple[Posture, Sta
     Leaves have the shape (runs, ...).
     """
 
-    def of_run(one: Conditions) -> tuple[Posture, StaticLimits, SideOutline, StepLimit]:
-        side, rests = resting_posture.side_outline(robot, one), resting_posture.posture(robot, one)
-        return rests, posture_limits(robot, one), side.with_pitch(rests.pitch), find_highest_step(side)
+    def results_of_run(one: Conditions) -> tuple[Posture, StaticLimits, SideOutline, StepLimit]:
+        side, posture = resting_posture.side_outline(robot, one), resting_posture.posture(robot, one)
+        return posture, posture_limits(robot, one), side.with_pitch(posture.pitch), find_highest_step(side)
 
-    return jax.vmap(of_run)(conditions)
+    return jax.vmap(results_of_run)(conditions)

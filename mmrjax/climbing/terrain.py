@@ -45,41 +45,46 @@ class Terrain(eqx.Module):
         # A repeated vertex has no edge; its next different vertex gives the direction.
         return jnp.where((turn < -1e-15)[:, None], middle, jnp.asarray(_NOWHERE))
 
-    def inside(self, at: Float[Array, "n 2"]) -> Bool[Array, " n"]:
+    def inside(self, positions: Float[Array, "n 2"]) -> Bool[Array, " n"]:
         """True for points below the polyline."""
         a, b = self.points[:-1], self.points[1:]
-        under = (at[:, None, 0] >= a[:, 0]) & (at[:, None, 0] < b[:, 0])
-        return jnp.any(under & (_cross_product(b - a, at[:, None] - a) < 0), axis=1)
+        is_above_edge = (positions[:, None, 0] >= a[:, 0]) & (positions[:, None, 0] < b[:, 0])
+        return jnp.any(is_above_edge & (_cross_product(b - a, positions[:, None] - a) < 0), axis=1)
 
-    def distance(self, at: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "n 2"]]:
+    def distance(self, positions: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "n 2"]]:
         """Distance of points from the ground [m], negative below it, and the normal of the ground at the nearest
         point.
 
         The normal is the gradient of the distance: that of the nearest edge, or away from the nearest corner.
         """
-        a, along = self.points[:-1], self.points[1:] - self.points[:-1]
-        square = jnp.maximum(jnp.sum(along**2, axis=1), 1e-30)  # 0 for a repeated vertex
-        from_a = at[:, None] - a
-        share = jnp.clip(jnp.sum(from_a * along, axis=-1) / square, 0.0, 1.0)
-        off = from_a - share[..., None] * along
-        squared = jnp.sum(off**2, axis=-1)
+        a = self.points[:-1]
+        edges = self.points[1:] - self.points[:-1]
+        square = jnp.maximum(jnp.sum(edges**2, axis=1), 1e-30)  # 0 for a repeated vertex
+        from_a = positions[:, None] - a
+        share = jnp.clip(jnp.sum(from_a * edges, axis=-1) / square, 0.0, 1.0)
+        offset = from_a - share[..., None] * edges
+        squared = jnp.sum(offset**2, axis=-1)
         nearest = jnp.argmin(squared, axis=1)[:, None]
-        off, share, least = _at(off, nearest), _at(share, nearest), _at(squared, nearest)
-        length = jnp.sqrt(jnp.maximum(least, 1e-300))
-        sign = jnp.where(self.inside(at), -1.0, 1.0)
-        edge = along / jnp.sqrt(square)[:, None]
-        edge = jnp.stack([-edge[:, 1], edge[:, 0]], axis=1)[nearest[:, 0]]
-        is_inside = (share > 0) & (share < 1) | (least < 1e-24)
-        normal = jnp.where(is_inside[:, None], edge, (sign / length)[:, None] * off)
-        return jnp.where(is_inside, jnp.sum(edge * off, axis=1), sign * length) - self.nose, normal
+        offset, share, least_square = (
+            _take_nearest(offset, nearest),
+            _take_nearest(share, nearest),
+            _take_nearest(squared, nearest),
+        )
+        length = jnp.sqrt(jnp.maximum(least_square, 1e-300))
+        sign = jnp.where(self.inside(positions), -1.0, 1.0)
+        edge_normal = edges / jnp.sqrt(square)[:, None]
+        edge_normal = jnp.stack([-edge_normal[:, 1], edge_normal[:, 0]], axis=1)[nearest[:, 0]]
+        is_inside = (share > 0) & (share < 1) | (least_square < 1e-24)
+        normal = jnp.where(is_inside[:, None], edge_normal, (sign / length)[:, None] * offset)
+        return jnp.where(is_inside, jnp.sum(edge_normal * offset, axis=1), sign * length) - self.nose, normal
 
 
 def _cross_product(a: Array, b: Array) -> Array:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _at(values: Array, which: Array) -> Array:
-    index = which[..., None] if values.ndim == 3 else which
+def _take_nearest(values: Array, nearest: Array) -> Array:
+    index = nearest[..., None] if values.ndim == 3 else nearest
     return jnp.take_along_axis(values, index, axis=1)[:, 0]
 
 
@@ -131,8 +136,8 @@ def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, s
         raise ValueError(f"terrain: got x of shape {x.shape} and z of {z.shape}; expected two points or more")
     if not (np.isfinite(x).all() and np.isfinite(z).all()):
         raise ValueError("terrain: got a point that is not a number; expected metres")
-    if (points_of_falls := np.flatnonzero(np.diff(x) < 0)).size:
-        k = int(points_of_falls[0])
+    if (falls := np.flatnonzero(np.diff(x) < 0)).size:
+        k = int(falls[0])
         raise ValueError(
             f"terrain: x falls from {x[k]:g} to {x[k + 1]:g} m at point {k + 2}; expected ground without "
             "overhangs, x never falling"
@@ -140,8 +145,8 @@ def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, s
     keep = np.concatenate([[True], (np.diff(x) != 0) | (np.diff(z) != 0)])
     x, z = x[keep], z[keep]
     rise = np.where(np.diff(x) == 0, np.diff(z), 0.0)
-    if (points_of_falls := np.flatnonzero(rise[1:] * rise[:-1] < 0)).size:
-        k = int(points_of_falls[0]) + 1
+    if (falls := np.flatnonzero(rise[1:] * rise[:-1] < 0)).size:
+        k = int(falls[0]) + 1
         raise ValueError(
             f"terrain: z goes from {z[k]:g} back to {z[k + 1]:g} m at x = {x[k]:g} m; expected a wall up or down"
         )

@@ -54,13 +54,13 @@ OF_STRAIGHT = 5
 #: Unknowns that settle on level ground.
 SETTLING = 7
 
-#: First search for a settled turn: step of an unknown for a finite difference, a change that ends the search [units],
-#: largest number of evaluations, and largest distance of the last step from the end of the search.
+#: First search for a settled turn. `ALONG`: step of an unknown for a finite difference. `NEAR`: change that ends the
+#: search [units]. `SOON`: largest number of evaluations. `CLOSE`: largest Newton step at the end of the search.
 ALONG, NEAR, SOON, CLOSE = 1e-6, 1e-7, 60, 1e-6
-#: Second search, by implicit Euler: first, shortest and longest step [s]; factors of the next step, and of a shorter
-#: one if the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units. The shortest step is
-#: accepted at any rates: it follows the run, and the rates may grow along it, as when friction or the gearbox's power
-#: changes direction.
+#: Second search, by implicit Euler: first, shortest and longest step [s], and factors of a longer and a shorter step.
+#: A step is shortened if the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units. The
+#: shortest step is accepted at any rates. It follows the run, along which the rates may grow, for example if friction
+#: or the gearbox's power changes direction.
 FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.05, 1e-4, 1e9, 3.0, 0.25, 1.05, 0.1
 #: Number of members searched at a time; few members of a batch need it.
 FEW = 32
@@ -75,8 +75,8 @@ def _effects_with_memory(robot: Robot, size: int) -> tuple[Effect, ...]:
     return robot.remembering if size > len(_UNITS) else ()
 
 
-def _units_of_unknowns(kept: tuple[Effect, ...]) -> Array:
-    return jnp.asarray((*_UNITS, *(size for e in kept for size in (e.memory_size or 1.0,) * 2)))
+def _units_of_unknowns(memory_effects: tuple[Effect, ...]) -> Array:
+    return jnp.asarray((*_UNITS, *(size for e in memory_effects for size in (e.memory_size or 1.0,) * 2)))
 
 
 def motion_of_unknowns(robot: Robot, y: Unknowns) -> PlaneMotion:
@@ -97,13 +97,14 @@ def turning_rates(robot: Robot, conditions: Conditions, y: Unknowns) -> Unknowns
 
 
 def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Travel) -> Array:
-    motion, memory_effects = motion_of_unknowns(robot, y), _effects_with_memory(robot, y.shape[0])
+    motion = motion_of_unknowns(robot, y)
+    memory_effects = _effects_with_memory(robot, y.shape[0])
     signals = travel.signals
-    free = conditions.of_sides().motor_speed is None
+    is_free = conditions.of_sides().motor_speed is None
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
-    residuals = [
-        *(free * signals.voltage_left / signals.inductance),
-        *(free * signals.acceleration_wheel * robot.gearbox.ratio),
+    rates = [
+        *(is_free * signals.voltage_left / signals.inductance),
+        *(is_free * signals.acceleration_wheel * robot.gearbox.ratio),
         travel.acceleration,
         travel.acceleration_lateral,
         travel.acceleration_yaw,
@@ -113,10 +114,8 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
         balances.charge_drawn(robot, conditions, signals.total_current[0]),
     ]
     for effect in memory_effects:
-        residuals.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
-    return jnp.stack([jnp.asarray(x, y.dtype) for x in residuals]) / _units_of_unknowns(memory_effects).astype(
-        y.dtype
-    )
+        rates.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
+    return jnp.stack([jnp.asarray(x, y.dtype) for x in rates]) / _units_of_unknowns(memory_effects).astype(y.dtype)
 
 
 def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Unknowns:
@@ -125,19 +124,24 @@ def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -
     Motors with an imposed speed turn.
     """
     heading = 0.0 if conditions.heading_deg is None else jnp.radians(conditions.heading_deg)
-    size, sides = _units_of_unknowns(robot.remembering), conditions.of_sides()
-    y = jnp.zeros_like(size).at[7].set(heading).at[10].set(conditions.discharge)
-    if sides.motor_speed is not None:
-        y = y.at[2:4].set(sides.motor_speed)
+    units = _units_of_unknowns(robot.remembering)
+    side_conditions = conditions.of_sides()
+    y = jnp.zeros_like(units).at[7].set(heading).at[10].set(conditions.discharge)
+    if side_conditions.motor_speed is not None:
+        y = y.at[2:4].set(side_conditions.motor_speed)
     if not rolling:
-        return y / size
+        return y / units
     unknowns, solved = _find_settled_unknowns(robot, conditions)
-    travel, settled = _signals_and_motion(robot, conditions, unknowns)
+    travel, motion = _signals_and_motion(robot, conditions, unknowns)
     signals = travel.signals
     memory = [jax.vmap(lambda s, e=e: e.settled(robot, s))(signals) for e in robot.remembering]
-    flat = [settled.current, settled.speed_motor, *(jnp.reshape(getattr(settled, name), 1) for name in _OF_ROBOT)]
-    rolls = jnp.concatenate([*flat, *memory]).at[7].set(y[7])
-    return jnp.where(solved & jnp.all(jnp.isfinite(rolls)), rolls, y) / size
+    motion_values = [
+        motion.current,
+        motion.speed_motor,
+        *(jnp.reshape(getattr(motion, name), 1) for name in _OF_ROBOT),
+    ]
+    rolling_values = jnp.concatenate([*motion_values, *memory]).at[7].set(y[7])
+    return jnp.where(solved & jnp.all(jnp.isfinite(rolling_values)), rolling_values, y) / units
 
 
 # --- circling
@@ -145,13 +149,14 @@ def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -
 
 def _initial_guess(robot: Robot, conditions: Conditions) -> Float[Array, " 11"]:
     """Motors near their no-load speed, and the turn of a robot with twice the width and no slip."""
-    sides, chassis = conditions.of_sides(), robot.chassis(conditions.configuration)
-    shafts = 0.9 * jax.vmap(lambda c: voltage_at_rest(robot, c))(sides) / robot.motor.torque_constant
-    if sides.motor_speed is not None:
-        shafts = sides.motor_speed
-    speeds = chassis.radius * shafts / robot.gearbox.ratio
-    turn = (speeds[1] - speeds[0]) / (2 * chassis.turning.width)
-    y = jnp.zeros(len(_UNITS)).at[2:4].set(shafts).at[4].set(jnp.mean(speeds)).at[6].set(turn)
+    side_conditions = conditions.of_sides()
+    chassis = robot.chassis(conditions.configuration)
+    motor_speeds = 0.9 * jax.vmap(lambda c: voltage_at_rest(robot, c))(side_conditions) / robot.motor.torque_constant
+    if side_conditions.motor_speed is not None:
+        motor_speeds = side_conditions.motor_speed
+    speeds = chassis.radius * motor_speeds / robot.gearbox.ratio
+    yaw_rate = (speeds[1] - speeds[0]) / (2 * chassis.turning.width)
+    y = jnp.zeros(len(_UNITS)).at[2:4].set(motor_speeds).at[4].set(jnp.mean(speeds)).at[6].set(yaw_rate)
     return y.at[10].set(conditions.discharge) / jnp.asarray(_UNITS)
 
 
@@ -162,14 +167,14 @@ class _BroydenSearch(eqx.Module):
         y: unknowns that settle, and the loads.
         rates: `_scaled_balance` at y.
         inverse: approximate inverse of minus its Jacobian.
-        looks: number of evaluations of `_scaled_balance`.
+        evaluations: number of evaluations of `_scaled_balance`.
         solved: True once the search has converged.
     """
 
     y: Settling
     rates: Settling
     inverse: Float[Array, "9 9"]
-    looks: Scalar
+    evaluations: Scalar
     solved: Array
 
 
@@ -205,8 +210,10 @@ def _scaled_balance(robot: Robot, conditions: Conditions, y: Settling) -> Settli
 
 def _imbalance_of_sides(robot: Robot, conditions: Conditions, y: Settling, travel: balances.Travel) -> Settling:
     """`_scaled_balance` from the signals of both sides."""
-    lacking = travel.grip.lacking / _load_units(robot, conditions)
-    return jnp.concatenate([_rates(robot, conditions, _all_unknowns(conditions, y), travel)[:SETTLING], -lacking])
+    load_residual = travel.grip.residual / _load_units(robot, conditions)
+    return jnp.concatenate(
+        [_rates(robot, conditions, _all_unknowns(conditions, y), travel)[:SETTLING], -load_residual]
+    )
 
 
 def _all_unknowns(conditions: Conditions, y: Settling) -> Float[Array, " 11"]:
@@ -220,17 +227,20 @@ def _speeds_over_width(robot: Robot, conditions: Conditions, y: Settling) -> Flo
     width [-].
     """
     chassis = robot.chassis(conditions.configuration)
-    _, shafts, ahead, _, yaw = jnp.split(y[:SETTLING] * jnp.asarray(_UNITS[:SETTLING]), [2, 4, 5, 6])
-    sides, movers = ahead - yaw * SIDES * chassis.turning.width, shafts * chassis.radius / robot.gearbox.ratio
-    return jnp.concatenate([sides, movers]) / chassis.speed_still
+    _, motor_speeds, ahead, _, yaw = jnp.split(y[:SETTLING] * jnp.asarray(_UNITS[:SETTLING]), [2, 4, 5, 6])
+    side_speeds, mover_speeds = (
+        ahead - yaw * SIDES * chassis.turning.width,
+        motor_speeds * chassis.radius / robot.gearbox.ratio,
+    )
+    return jnp.concatenate([side_speeds, mover_speeds]) / chassis.speed_still
 
 
 def _allowed_step_fraction(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scalar:
     """Fraction of a step that changes no unknown by more than `FAR` and reverses no friction."""
     share = jnp.minimum(1.0, FAR / jnp.max(jnp.abs(step[:SETTLING])))
-    now, then = (_speeds_over_width(robot, conditions, state_there) for state_there in (y, y + share * step))
-    across = (now * then < 0) & (jnp.minimum(jnp.abs(now), jnp.abs(then)) > 1)
-    return share * jnp.min(jnp.where(across, now / jnp.where(across, now - then, 1.0), 1.0))
+    speeds_now, speeds_then = (_speeds_over_width(robot, conditions, unknowns) for unknowns in (y, y + share * step))
+    reverses = (speeds_now * speeds_then < 0) & (jnp.minimum(jnp.abs(speeds_now), jnp.abs(speeds_then)) > 1)
+    return share * jnp.min(jnp.where(reverses, speeds_now / jnp.where(reverses, speeds_now - speeds_then, 1.0), 1.0))
 
 
 def _load_units(robot: Robot, conditions: Conditions) -> Pair:
@@ -248,27 +258,29 @@ def _search_start(robot: Robot, conditions: Conditions) -> Settling:
     return jnp.concatenate([_initial_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
 
 
-def _begin_broyden(held: tuple[Robot, Conditions]) -> _BroydenSearch:
-    start = _search_start(*held)
+def _begin_broyden(inputs: tuple[Robot, Conditions]) -> _BroydenSearch:
+    start = _search_start(*inputs)
     return _BroydenSearch(start, jnp.zeros_like(start), jnp.eye(start.size), jnp.asarray(0), jnp.asarray(False))
 
 
-def _broyden_step(held: tuple[Robot, Conditions], search: _BroydenSearch) -> _BroydenSearch:
+def _broyden_step(inputs: tuple[Robot, Conditions], search: _BroydenSearch) -> _BroydenSearch:
     """Next evaluation: at the start, then along each unknown from there, then along the secants."""
     size = search.y.size
-    is_probing = search.looks <= size
+    is_probing = search.evaluations <= size
     step = (search.inverse * search.rates).sum(-1)
-    damped_step = step * _allowed_step_fraction(*held, search.y, step)
-    damped_step = jnp.where(is_probing, ALONG * (np.arange(size) == search.looks - 1), damped_step)
-    residual = _scaled_balance(*held, search.y + damped_step)
-    residual = jnp.where(_is_searched(held[1]), residual, _search_start(*held) - search.y - damped_step)
+    damped_step = step * _allowed_step_fraction(*inputs, search.y, step)
+    damped_step = jnp.where(is_probing, ALONG * (np.arange(size) == search.evaluations - 1), damped_step)
+    residual = _scaled_balance(*inputs, search.y + damped_step)
+    residual = jnp.where(_is_searched(inputs[1]), residual, _search_start(*inputs) - search.y - damped_step)
     predicted_step = search.inverse @ (search.rates - residual)
     row = damped_step @ search.inverse
     change = jnp.outer(damped_step - predicted_step, row) / (damped_step @ predicted_step)
-    inverse = jnp.where((search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse)
+    inverse = jnp.where(
+        (search.evaluations > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse
+    )
     y = jnp.where(is_probing, search.y, search.y + damped_step)
-    rates = jnp.where(is_probing & (search.looks > 0), search.rates, residual)
-    return _BroydenSearch(y, rates, inverse, search.looks + 1, ~is_probing & (jnp.max(jnp.abs(step)) < NEAR))
+    rates = jnp.where(is_probing & (search.evaluations > 0), search.rates, residual)
+    return _BroydenSearch(y, rates, inverse, search.evaluations + 1, ~is_probing & (jnp.max(jnp.abs(step)) < NEAR))
 
 
 def _jacobian_at_rest(conditions: Conditions) -> Float[np.ndarray, "9 9"]:
@@ -282,66 +294,74 @@ def _jacobian_and_value(robot: Robot, conditions: Conditions, y: Array) -> tuple
     return jnp.where(_is_searched(conditions)[:, None], slope, _jacobian_at_rest(conditions)), residual
 
 
-def _no_linearisation(held: tuple[Robot, Conditions, Array, Array]) -> _LinearisedBalance:
-    return jnp.asarray(_jacobian_at_rest(held[1])), jnp.asarray(False), jnp.asarray(False)
+def _no_linearisation(inputs: tuple[Robot, Conditions, Array, Array]) -> _LinearisedBalance:
+    return jnp.asarray(_jacobian_at_rest(inputs[1])), jnp.asarray(False), jnp.asarray(False)
 
 
-def _linearise_balance(held: tuple[Robot, Conditions, Array, Array], _: _LinearisedBalance) -> _LinearisedBalance:
-    y, solved = held[2:]
-    slope, residual = _jacobian_and_value(*held[:2], y)
+def _linearise_balance(inputs: tuple[Robot, Conditions, Array, Array], _: _LinearisedBalance) -> _LinearisedBalance:
+    y, solved = inputs[2:]
+    slope, residual = _jacobian_and_value(*inputs[:2], y)
     inverted, determinant = inverse(-slope)
-    close = jnp.max(jnp.abs(inverted @ residual)) < CLOSE
-    return slope, solved & close & (determinant > 0), jnp.asarray(True)
+    is_close = jnp.max(jnp.abs(inverted @ residual)) < CLOSE
+    return slope, solved & is_close & (determinant > 0), jnp.asarray(True)
 
 
-def _begin_euler(held: tuple[Robot, Conditions, Array, _LinearisedBalance]) -> _EulerSearch:
+def _begin_euler(inputs: tuple[Robot, Conditions, Array, _LinearisedBalance]) -> _EulerSearch:
     """State before the first step, which has length 0 and only evaluates."""
-    y, (jacobian, sound, _) = held[2:]
-    y = jnp.where(sound, y, _search_start(*held[:2]))
-    slope = jnp.where(sound, jacobian, _jacobian_at_rest(held[1]))
-    return _EulerSearch(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), sound)
+    y, (jacobian, is_turn, _) = inputs[2:]
+    y = jnp.where(is_turn, y, _search_start(*inputs[:2]))
+    slope = jnp.where(is_turn, jacobian, _jacobian_at_rest(inputs[1]))
+    return _EulerSearch(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), is_turn)
 
 
-def _euler_step(held: tuple[Robot, Conditions, Array, _LinearisedBalance], search: _EulerSearch) -> _EulerSearch:
+def _euler_step(inputs: tuple[Robot, Conditions, Array, _LinearisedBalance], search: _EulerSearch) -> _EulerSearch:
     """One implicit Euler step along the run. It is rejected if the rates grow or an unknown changes too much."""
-    slow = np.diag(np.arange(search.y.size) < SETTLING)
-    step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0] @ search.rates
-    largest, next_y = jnp.max(jnp.abs(step)), search.y + step
-    slope, residual = _jacobian_and_value(*held[:2], next_y)
-    before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(residual)
-    worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
-    worse &= search.step > SHORTEST
-    has_settled = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
+    settling_mask = np.diag(np.arange(search.y.size) < SETTLING)
+    step = inverse(jnp.asarray(settling_mask) / search.step - search.jacobian)[0] @ search.rates
+    largest_change = jnp.max(jnp.abs(step))
+    next_y = search.y + step
+    slope, residual = _jacobian_and_value(*inputs[:2], next_y)
+    norm_before, norm_after = jnp.linalg.norm(search.rates), jnp.linalg.norm(residual)
+    is_rejected = (~(norm_after <= WORSE * norm_before + SMALL) | (largest_change > FAR)) & (search.turns > 0)
+    is_rejected &= search.step > SHORTEST
+    has_settled = ~is_rejected & (largest_change < SMALL) & ((search.step > LONG) | (norm_after < SMALL_RATE))
     y, residual, slope = (
-        jnp.where(worse, old, new)
+        jnp.where(is_rejected, old, new)
         for old, new in ((search.y, next_y), (search.rates, residual), (search.jacobian, slope))
     )
-    length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
+    length = jnp.clip(search.step * jnp.where(is_rejected, SHORTER, LONGER), SHORTEST, LONGEST)
     return _EulerSearch(y, residual, slope, length, search.turns + 1, has_settled)
 
 
 def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
-    """The unknowns of a settled turn on level ground, see `_EulerSearch`, and whether it was found.
+    """The unknowns of a settled turn on level ground, see `_EulerSearch`, and True if it was found.
 
     Broyden's method, which first evaluates along each unknown, finds most. If it does not converge, or converges to
     an unstable turn, implicit Euler with growing steps follows a run until it settles. Only its shortest steps may
     let the rates grow. The last step is Newton's and carries the implicit derivatives.
 
     Of 128 turns at random duties this finds all, and optimistix's `Newton` from the same start finds 83. In batches
-    each member ends on its own (`lanes`), while a search by `optimistix.root_find` lasts as long as its slowest.
+    each member ends on its own (`batch_flow.loop_until`). A search by `optimistix.root_find` lasts as long as its
+    slowest member.
     """
     inputs = robot, conditions
-    first = batch_flow.loop_until(
-        _begin_broyden, _broyden_step, lambda s: (s.looks >= SOON) | s.solved, inputs, lambda s: (s.y, s.solved)
+    broyden_end = batch_flow.loop_until(
+        _begin_broyden, _broyden_step, lambda s: (s.evaluations >= SOON) | s.solved, inputs, lambda s: (s.y, s.solved)
     )
-    solution = batch_flow.loop_until(_no_linearisation, _linearise_balance, lambda s: s[2], (*inputs, *first))
-    end = batch_flow.loop_until(
-        _begin_euler, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*inputs, first[0], solution), most=FEW
+    linearisation = batch_flow.loop_until(
+        _no_linearisation, _linearise_balance, lambda s: s[2], (*inputs, *broyden_end)
     )
-    is_solved = end.solved & jnp.all(jnp.isfinite(end.jacobian))
-    slope = jnp.where(is_solved, end.jacobian, jnp.asarray(_jacobian_at_rest(conditions)))
-    return end.y + inverse(-slope)[0] @ jnp.where(
-        is_solved, _scaled_balance(robot, conditions, end.y), 0.0
+    euler_end = batch_flow.loop_until(
+        _begin_euler,
+        _euler_step,
+        lambda s: (s.turns >= TURNS) | s.solved,
+        (*inputs, broyden_end[0], linearisation),
+        lane_count=FEW,
+    )
+    is_solved = euler_end.solved & jnp.all(jnp.isfinite(euler_end.jacobian))
+    slope = jnp.where(is_solved, euler_end.jacobian, jnp.asarray(_jacobian_at_rest(conditions)))
+    return euler_end.y + inverse(-slope)[0] @ jnp.where(
+        is_solved, _scaled_balance(robot, conditions, euler_end.y), 0.0
     ), is_solved
 
 
@@ -351,29 +371,33 @@ def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tu
     The duties alone would cause these currents, see `rest.admitted_current`.
     """
     motion = motion_of_unknowns(robot, _all_unknowns(conditions, y))
-    current, is_limited = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(
+    current, blocked_voltage = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(
         conditions.of_sides(), motion.current
     )
     motion = replace(motion, current=jnp.asarray(current))
     travel = _turning(rest.without_diode(robot), conditions, motion, y[SETTLING:] * _load_units(robot, conditions))
     signals = travel.signals
-    signals = replace(signals, voltage=signals.voltage - is_limited, voltage_left=signals.voltage_left - is_limited)
+    signals = replace(
+        signals, voltage=signals.voltage - blocked_voltage, voltage_left=signals.voltage_left - blocked_voltage
+    )
     return replace(travel, signals=signals), motion
 
 
 def solve_turn(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
-    """Unknowns of a settled turn, and True if it was found, see `Implicit.solve`."""
+    """Unknowns of a settled turn, and True if it was found, see `ImplicitSolution.solve`."""
     return jax.lax.stop_gradient(_find_settled_unknowns(*jax.lax.stop_gradient((robot, conditions))))
 
 
 def turn_results(
-    robot: Robot, conditions: Conditions, unknowns: Settling, found: Bool[Array, ""]
+    robot: Robot, conditions: Conditions, unknowns: Settling, solved: Bool[Array, ""]
 ) -> tuple[Result, Signals, Settling]:
-    """Result, signals of both sides and residuals of the balances at given unknowns, see `Implicit.shown`."""
+    """Result, signals of both sides and residuals at given unknowns, see `ImplicitSolution.results_at`."""
     travel, motion = _signals_and_motion(robot, conditions, unknowns)
-    stays = unknowns - jax.lax.stop_gradient(_search_start(robot, conditions))
-    imbalance = jnp.where(_is_searched(conditions), _imbalance_of_sides(robot, conditions, unknowns, travel), stays)
-    status = _turn_status(robot, conditions, travel, motion, found)
+    deviation_from_start = unknowns - jax.lax.stop_gradient(_search_start(robot, conditions))
+    imbalance = jnp.where(
+        _is_searched(conditions), _imbalance_of_sides(robot, conditions, unknowns, travel), deviation_from_start
+    )
+    status = _turn_status(robot, conditions, travel, motion, solved)
     return result_of_turn(robot, travel, status), travel.signals, imbalance
 
 
@@ -395,11 +419,11 @@ def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Tra
 
 
 def _turn_status(
-    robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion, found: Array
+    robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion, solved: Array
 ) -> Array:
-    """Status of a settled turn, whether it was found or not."""
+    """Status of a settled turn, or `not_settled` if none was found."""
     status = status_of_steady_motion(robot, conditions, travel, motion)
-    return jnp.where(found | (status == BATTERY_EMPTY), status, NOT_SETTLED)
+    return jnp.where(solved | (status == BATTERY_EMPTY), status, NOT_SETTLED)
 
 
 def _motion_size(chassis: Chassis, ahead: Scalar, aside: Scalar, yaw: Scalar) -> Array:
@@ -412,12 +436,14 @@ def status_of_steady_motion(
 ) -> Array:
     """Status of a robot in steady motion."""
     chassis = robot.chassis(conditions.configuration)
-    shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
+    shaft_speed = jnp.max(jnp.abs(travel.signals.speed_theoretical))
     motion_size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
-    status = jnp.where(jnp.minimum(shafts, motion_size) < chassis.speed_still, STALLED, CONVERGED)
+    status = jnp.where(jnp.minimum(shaft_speed, motion_size) < chassis.speed_still, STALLED, CONVERGED)
     grip, load = travel.grip, jnp.sum(travel.grip.normal)
-    tips = (jnp.abs(grip.moved) >= load / 2) | (jnp.abs(grip.centre) >= robot.running_gear.wheelbase / 2)
-    status = jnp.where(tips, TIPS, status)
+    is_tipping = (jnp.abs(grip.load_transfer) >= load / 2) | (
+        jnp.abs(grip.centre) >= robot.running_gear.wheelbase / 2
+    )
+    status = jnp.where(is_tipping, TIPS, status)
     return jnp.where(robot.battery.emptied(conditions.battery, motion.discharge), BATTERY_EMPTY, status)
 
 
@@ -426,10 +452,12 @@ def status_after_run(robot: Robot, conditions: Conditions, travel: balances.Trav
     `status_of_steady_motion`.
     """
     chassis = robot.chassis(conditions.configuration)
-    size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
-    change = _motion_size(chassis, travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw)
+    motion_size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
+    acceleration_size = _motion_size(
+        chassis, travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw
+    )
     status = status_of_steady_motion(robot, conditions, travel, motion)
-    return jnp.where((change * TIME > SHARE * size) & (status == CONVERGED), NOT_SETTLED, status)
+    return jnp.where((acceleration_size * TIME > SHARE * motion_size) & (status == CONVERGED), NOT_SETTLED, status)
 
 
 def changing_at_rest(y: Unknowns) -> Unknowns:
@@ -437,23 +465,23 @@ def changing_at_rest(y: Unknowns) -> Unknowns:
     return jnp.zeros_like(y).at[jnp.asarray([0, 1, 10])].set(1.0)
 
 
-norm = functools.partial(error_norm_of_sides, whole=slice(4, len(_UNITS)), own=OF_STRAIGHT)
+norm = functools.partial(error_norm_of_sides, of_robot=slice(4, len(_UNITS)), count=OF_STRAIGHT)
 
 
 def _sides_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
     """Conditions of each side, with the slope along its heading, and its state."""
-    sides = conditions.of_sides()
-    slope_along = jnp.degrees(jnp.arcsin(jnp.sin(sides.slope) * jnp.cos(motion.heading)))
+    side_conditions = conditions.of_sides()
+    slope_along = jnp.degrees(jnp.arcsin(jnp.sin(side_conditions.slope) * jnp.cos(motion.heading)))
     return (
-        replace(sides, slope_deg=slope_along, heading_deg=None),
+        replace(side_conditions, slope_deg=slope_along, heading_deg=None),
         balances.states_of_sides(robot, conditions, motion),
     )
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Pair:
     """Currents that settle in a standing robot [A]."""
-    sides, state = _sides_at_rest(robot, conditions, motion)
-    return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(sides, state))
+    side_conditions, state = _sides_at_rest(robot, conditions, motion)
+    return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(side_conditions, state))
 
 
 def holding_margin(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Array:
@@ -461,12 +489,16 @@ def holding_margin(robot: Robot, conditions: Conditions, motion: PlaneMotion) ->
 
     The friction of each side has to hold its motor and its share of gravity. The ground has to hold all of gravity.
     """
-    own, state = _sides_at_rest(robot, conditions, motion)
-    sides = jax.vmap(lambda c, s: rest.holding_margin(robot, c, s))(own, state)
+    side_conditions, state = _sides_at_rest(robot, conditions, motion)
+    side_margins = jax.vmap(lambda c, s: rest.holding_margin(robot, c, s))(side_conditions, state)
     chassis = robot.chassis(conditions.configuration)
-    level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
+    lateral_grip = (
+        chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
+    )
     lateral_slope = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
-    return rest.smallest_of(sides[0], sides[1], jnp.where(lateral_slope > 0, level - lateral_slope, jnp.inf))
+    return rest.smallest_of(
+        side_margins[0], side_margins[1], jnp.where(lateral_slope > 0, lateral_grip - lateral_slope, jnp.inf)
+    )
 
 
 def holds(robot: Robot, conditions: Conditions) -> Array:
@@ -504,17 +536,17 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     """A settled turn, see `circling_signals`, and True if its conditions are valid. All numbers are finite for every
     status.
     """
-    is_solved = jnp.asarray(True)
+    is_valid = jnp.asarray(True)
     for number in jax.tree.leaves(conditions):
-        is_solved &= jnp.isfinite(number)
-    conditions = jax.tree.map(lambda x: jnp.where(is_solved, x, jnp.ones_like(x)), conditions)
+        is_valid &= jnp.isfinite(number)
+    conditions = jax.tree.map(lambda x: jnp.where(is_valid, x, jnp.ones_like(x)), conditions)
     travel, _, status = circling_signals(robot, conditions)
     # On a slope the heading changes continuously.
     status = jnp.where(conditions.slope_deg == 0, status, NOT_SETTLED)
-    return result_of_turn(robot, travel, jnp.where(is_solved, status, FAILED)), is_solved
+    return result_of_turn(robot, travel, jnp.where(is_valid, status, FAILED)), is_valid
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
     """Result of `steady` for a robot that turns, see `circling_signals`. NaN if there is no settled turn."""
-    point, is_solved = operating_point(robot, conditions)
-    return withhold_numbers(point, (point.status == CONVERGED) | (point.status == STALLED), is_solved)
+    point, is_valid = operating_point(robot, conditions)
+    return withhold_numbers(point, (point.status == CONVERGED) | (point.status == STALLED), is_valid)

@@ -111,20 +111,20 @@ class GroundForces(eqx.Module):
         normal: normal load of each side [N].
         ahead, aside: longitudinal and lateral force [N].
         moment: moment of the lateral forces about the centre of mass, positive to the left [N·m].
-        across: power lost by lateral sliding [W].
-        moved: load transferred from the left to the right side [N].
+        lateral_power: power lost by lateral sliding [W].
+        load_transfer: load transferred from the left to the right side [N].
         centre: centre of pressure ahead of the middle of the contact [m].
-        lacking: residual of these two: what the forces give minus the values used [N, m]. 0 except during a search.
+        residual: residual of these two: what the forces give minus the values used [N, m]. 0 except during a search.
     """
 
     normal: Pair
     ahead: Pair
     aside: Pair
     moment: Pair
-    across: Pair
-    moved: Scalar
+    lateral_power: Pair
+    load_transfer: Scalar
     centre: Scalar
-    lacking: Pair
+    residual: Pair
 
 
 def loaded_part(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
@@ -135,10 +135,11 @@ def loaded_part(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]
     |x_p| = L/6 on it is a triangle of length 3 (L/2 - |x_p|), up to the lift-off of the contact (middle third rule).
     Wheels: by the lever.
     """
-    tracks, length = stance.on_tracks > 0.5, stance.length
+    tracks = stance.on_tracks > 0.5
+    length = stance.length
     tilt = jnp.clip(jnp.where(tracks, 6.0, 2.0) * centre / length, -1.0, 1.0)
-    borne = jnp.where(tracks, jnp.clip(3 * (length / 2 - jnp.abs(centre)), 1e-6 * length, length), length)
-    return jnp.sign(centre) * (length - borne) / 2, borne / 2, tilt
+    loaded_length = jnp.where(tracks, jnp.clip(3 * (length / 2 - jnp.abs(centre)), 1e-6 * length, length), length)
+    return jnp.sign(centre) * (length - loaded_length) / 2, loaded_length / 2, tilt
 
 
 class ContactLaw(eqx.Module):
@@ -155,33 +156,33 @@ class ContactLaw(eqx.Module):
     on_tracks: Scalar
     nodes: int = eqx.field(static=True)
 
-    def places(self) -> Array:
+    def contact_nodes(self) -> Array:
         """Nodes on -1..1."""
         line = _quadrature_nodes(self.nodes)[0]
         return jnp.where(self.on_tracks > 0.5, line, np.sign(line))
 
-    def over(self, x: Scalar, most: int) -> Float[Array, "2 powers"]:
-        """Sums Σ w zᵏ x over the nodes z with their weights w, for k from 0 to `most`."""
+    def power_sums(self, x: Scalar, order: int) -> Float[Array, "2 powers"]:
+        """Sums Σ w zᵏ x over the nodes z with their weights w, for k from 0 to `order`."""
         line, share, ends = _quadrature_nodes(self.nodes)
-        powers = np.arange(most + 1)
-        of_line = share[:, None] * line[:, None] ** powers
-        of_ends = ends[:, None] * np.sign(line)[:, None] ** powers
-        line_and_ends = x @ np.concatenate([of_line, of_ends], axis=1)
-        return jnp.where(self.on_tracks > 0.5, line_and_ends[..., : most + 1], line_and_ends[..., most + 1 :])
+        powers = np.arange(order + 1)
+        line_weights = share[:, None] * line[:, None] ** powers
+        end_weights = ends[:, None] * np.sign(line)[:, None] ** powers
+        line_and_ends = x @ np.concatenate([line_weights, end_weights], axis=1)
+        return jnp.where(self.on_tracks > 0.5, line_and_ends[..., : order + 1], line_and_ends[..., order + 1 :])
 
     def per_speed(self, along: Scalar, across: Scalar) -> Scalar:
         """Longitudinal force per load and sliding speed [s/m], given the squares of the sliding speeds [m²/s²]."""
-        square, weighed = along + across, along + self.ratio * across
-        return jnp.sqrt((square + STILL) / (weighed + STILL)) * self.friction.per_speed(square)
+        square, weighted_square = along + across, along + self.ratio * across
+        return jnp.sqrt((square + STILL) / (weighted_square + STILL)) * self.friction.per_speed(square)
 
     def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
         """Derivatives of `per_speed` with respect to the squares of the sliding speeds [s³/m³]."""
-        square, weighed = along + across, along + self.ratio * across
-        slower = jnp.sqrt((square + STILL) / (weighed + STILL)) * self.friction.per_speed_rise(square)
-        share = self.per_speed(along, across) / 2
+        square, weighted_square = along + across, along + self.ratio * across
+        friction_part = jnp.sqrt((square + STILL) / (weighted_square + STILL)) * self.friction.per_speed_rise(square)
+        half_force = self.per_speed(along, across) / 2
         return (
-            slower + share * (1 / (square + STILL) - 1 / (weighed + STILL)),
-            slower + share * (1 / (square + STILL) - self.ratio / (weighed + STILL)),
+            friction_part + half_force * (1 / (square + STILL) - 1 / (weighted_square + STILL)),
+            friction_part + half_force * (1 / (square + STILL) - self.ratio / (weighted_square + STILL)),
         )
 
     def rises(self, along: Scalar, across: Scalar) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
@@ -189,14 +190,17 @@ class ContactLaw(eqx.Module):
 
         If the total force falls with sliding, the derivative is set to 0.
         """
-        square, other, speed_product = along**2, across**2, along * across
-        friction_per_speed, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
-        grows = friction_per_speed + 2 * (square * by_along + other * by_across)
-        stays = jnp.maximum(-grows, 0.0) / (square + other + STILL)
-        first, second = 2 * by_along + stays, 2 * by_across + stays
-        return (friction_per_speed + square * first, speed_product * second), (
-            speed_product * first,
-            friction_per_speed + other * second,
+        along_square, across_square, speed_product = along**2, across**2, along * across
+        friction_per_speed, (by_along, by_across) = (
+            self.per_speed(along_square, across_square),
+            self.per_speed_rise(along_square, across_square),
+        )
+        total_slope = friction_per_speed + 2 * (along_square * by_along + across_square * by_across)
+        correction = jnp.maximum(-total_slope, 0.0) / (along_square + across_square + STILL)
+        along_factor, across_factor = 2 * by_along + correction, 2 * by_across + correction
+        return (friction_per_speed + along_square * along_factor, speed_product * across_factor), (
+            speed_product * along_factor,
+            friction_per_speed + across_square * across_factor,
         )
 
 
@@ -212,8 +216,8 @@ def law_moments(law: ContactLaw, sliding: Pair, middle: Scalar, end: Scalar) -> 
         middle: lateral sliding speed at the middle of the contact [m/s].
         end: increase of the lateral speed from the middle to the front end [m/s].
     """
-    across = middle + end * law.places()
-    return law.over(law.per_speed(sliding[:, None] ** 2, across**2), 3)
+    across = middle + end * law.contact_nodes()
+    return law.power_sums(law.per_speed(sliding[:, None] ** 2, across**2), 3)
 
 
 @law_moments.def_jvp
@@ -223,24 +227,26 @@ def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     Derivatives with respect to the law's parameters are left to JAX.
     """
     law, sliding, middle, end = primals
-    across = middle + end * law.places()
+    across = middle + end * law.contact_nodes()
     along = sliding[:, None] ** 2
-    moments = law.over(law.per_speed(along, across**2), 3)
+    moments = law.power_sums(law.per_speed(along, across**2), 3)
     by_along, by_across = law.per_speed_rise(along, across**2)
     change = jnp.zeros_like(moments)
     if tangents[1] is not None:
-        change += 2 * (sliding * tangents[1])[:, None] * law.over(by_along, 3)
+        change += 2 * (sliding * tangents[1])[:, None] * law.power_sums(by_along, 3)
     if tangents[2] is not None or tangents[3] is not None:
-        first = law.over(by_across * across, 4)
+        first = law.power_sums(by_across * across, 4)
         for tangent, part in ((tangents[2], first[:, :4]), (tangents[3], first[:, 1:])):
             change += 0.0 if tangent is None else 2 * tangent * part
     if any(x is not None for x in jax.tree.leaves(tangents[0])):
-        change += eqx.filter_jvp(lambda law: law.over(law.per_speed(along, across**2), 3), (law,), (tangents[0],))[1]
+        change += eqx.filter_jvp(
+            lambda law: law.power_sums(law.per_speed(along, across**2), 3), (law,), (tangents[0],)
+        )[1]
     return moments, change
 
 
 class GroundForceInputs(NamedTuple):
-    """What both sides do on the ground.
+    """Inputs of the ground forces of both sides.
 
     Attributes:
         stance: stance of the robot.
@@ -274,85 +280,87 @@ class GroundForceInputs(NamedTuple):
         """
         if loads is not None:
             return _forces_at_loads(loads, None, self)
-        detached_inputs = jax.lax.stop_gradient(self)
-        solved_loads, rise = _solve_loads(detached_inputs)
+        constant_inputs = jax.lax.stop_gradient(self)
+        solved_loads, slopes = _solve_loads(constant_inputs)
         forces = _forces_at_loads(solved_loads, None, self)
         # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
-        change = _load_step(forces.lacking, rise.lacking)
-        return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
+        change = _load_step(forces.residual, slopes.residual)
+        return jax.tree.map(lambda x, slope: x - slope @ change, forces, slopes)
 
 
-def _load_step(lacking: Pair, slope: Float[Array, "2 2"]) -> Pair:
+def _load_step(residual: Pair, slope: Float[Array, "2 2"]) -> Pair:
     """Newton step of load transfer and centre of pressure, to be subtracted."""
     (a, b), (c, d) = slope
-    first, second = lacking
+    first, second = residual
     return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
 
 
-def _solve_loads(given: GroundForceInputs) -> tuple[Pair, GroundForces]:
+def _solve_loads(inputs: GroundForceInputs) -> tuple[Pair, GroundForces]:
     """Load transfer [N] and centre of pressure [m], and the derivatives of `GroundForces` with respect to them.
 
     The results carry no derivatives. While the whole contact is loaded, the moments of its law do not depend on the
     loads.
     """
-    stance, load = given.stance, given.load
+    stance, load = inputs.stance, inputs.load
 
-    def steps(loads: Array, given: GroundForceInputs, even: Array | None) -> tuple[Array, GroundForces]:
+    def solve(loads: Array, inputs: GroundForceInputs, uniform_moments: Array | None) -> tuple[Array, GroundForces]:
         def step(_: int, loads: Array) -> Array:
-            def lacking(x: Array) -> tuple[Array, Array]:
-                return (_forces_at_loads(x, even, given).lacking,) * 2
+            def residual(x: Array) -> tuple[Array, Array]:
+                return (_forces_at_loads(x, uniform_moments, inputs).residual,) * 2
 
-            slope, residual = jax.jacfwd(lacking, has_aux=True)(loads)
-            return loads - _load_step(residual, slope)
+            slope, load_residual = jax.jacfwd(residual, has_aux=True)(loads)
+            return loads - _load_step(load_residual, slope)
 
-        loads = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
-        return loads, jax.jacfwd(lambda x: _forces_at_loads(x, even, given))(loads)
+        loads = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=uniform_moments is not None)
+        return loads, jax.jacfwd(lambda x: _forces_at_loads(x, uniform_moments, inputs))(loads)
 
-    nothing = load * given.sliding[0]
-    first_loads = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
-    even = law_moments(*_moment_arguments(first_loads[1], given))
-    solution = steps(first_loads, given, even)
-    lifts = (stance.on_tracks > 0.5) & (
+    zero = load * inputs.sliding[0]
+    first_loads = jnp.stack([jnp.zeros_like(zero), stance.ahead * jnp.ones_like(zero)])
+    uniform_moments = law_moments(*_moment_arguments(first_loads[1], inputs))
+    solution = solve(first_loads, inputs, uniform_moments)
+    is_lifting = (stance.on_tracks > 0.5) & (
         jnp.maximum(jnp.abs(first_loads[1]), jnp.abs(solution[0][1])) > stance.length / 6
     )
-    return compute_if_needed(lifts, lambda loads, given: steps(loads, given, None), (first_loads, given), solution)
+    return compute_if_needed(
+        is_lifting, lambda loads, inputs: solve(loads, inputs, None), (first_loads, inputs), solution
+    )
 
 
-def _moment_arguments(centre: Scalar, given: GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:
+def _moment_arguments(centre: Scalar, inputs: GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:
     """Arguments of `law_moments` for a centre of pressure."""
-    stance, yaw = given.stance, given.yaw_rate
+    stance, yaw = inputs.stance, inputs.yaw_rate
     place, half, _ = loaded_part(stance, centre)
-    law = ContactLaw(given.friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
-    return law, given.sliding, -given.lateral_speed - yaw * (place - stance.ahead), -yaw * half
+    law = ContactLaw(inputs.friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
+    return law, inputs.sliding, -inputs.lateral_speed - yaw * (place - stance.ahead), -yaw * half
 
 
-def _forces_at_loads(loads: Array, even: Array | None, given: GroundForceInputs) -> GroundForces:
+def _forces_at_loads(loads: Array, uniform_moments: Array | None, inputs: GroundForceInputs) -> GroundForces:
     """Ground forces for a given load transfer and centre of pressure.
 
     The lateral speed is linear along a contact, and so is its load. Forces and moments are therefore sums of four
-    moments of the law over a uniform load. `even`: these moments, if known.
+    moments of the law over a uniform load. `uniform_moments`: these moments, if known.
     """
-    (transferred, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
-    normal = jnp.maximum(load / 2 - 2 * SIDES * transferred, 0.0)
+    (load_transfer, centre), stance, adhesion, load = loads, inputs.stance, inputs.adhesion, inputs.load
+    normal = jnp.maximum(load / 2 - 2 * SIDES * load_transfer, 0.0)
     place, half, tilt = loaded_part(stance, centre)
     arm = place - stance.ahead
-    law, sliding, middle, end = _moment_arguments(centre, given)
-    even = law_moments(law, sliding, middle, end) if even is None else even
-    zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
-    friction_limit, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
-    aside = across * (middle * zeroth + end * first)
-    turning_force = across * (middle * first + end * second)
+    law, sliding, middle, end = _moment_arguments(centre, inputs)
+    uniform_moments = law_moments(law, sliding, middle, end) if uniform_moments is None else uniform_moments
+    zeroth, first, second = (uniform_moments[:, k] + tilt * uniform_moments[:, k + 1] for k in range(3))
+    friction_limit, lateral_limit = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
+    aside = lateral_limit * (middle * zeroth + end * first)
+    lateral_moment = lateral_limit * (middle * first + end * second)
     ahead = friction_limit * zeroth * sliding
-    outward = stance.height * sum_of_sides(aside) / stance.width
+    outward_load = stance.height * sum_of_sides(aside) / stance.width
     # A vertical ground carries no normal load.
-    behind = stance.height * sum_of_sides(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
+    rearward_shift = stance.height * sum_of_sides(ahead - inputs.resistance * normal) / jnp.maximum(load, 1e-9)
     return GroundForces(
         normal=normal,
         ahead=ahead,
         aside=aside,
-        moment=arm * aside + half * turning_force,
-        across=middle * aside + end * turning_force,
-        moved=transferred,
+        moment=arm * aside + half * lateral_moment,
+        lateral_power=middle * aside + end * lateral_moment,
+        load_transfer=load_transfer,
         centre=centre,
-        lacking=loads - jnp.stack([outward, stance.ahead - behind]),
+        residual=loads - jnp.stack([outward_load, stance.ahead - rearward_shift]),
     )
