@@ -39,14 +39,14 @@ GEAR = (
 )
 FRICTION = ("static", "dynamic", "speed_static", "speed_dynamic")
 CHASSIS = ("radius", "on_tracks")
-#: Coordinates and velocities (see `undercarriage`) except the travel, which has no influence.
+#: Coordinates and velocities (see `side_contacts`) except the travel, which has no influence.
 MOTION = ("z", "pitch", "front", "rear", "v_x", "v_z", "v_pitch", "v_front", "v_rear")
 
 
 class ContactSums(eqx.Module):
     """Sums over the contacts of one side, for a given change of velocity Δv in a time step.
 
-    A contact's traction is F, its normal force R. The damping of the step (`half_robot.resistance`, without the
+    A contact's traction is F, its normal force R. The damping of the step (`half_robot.damping_matrix`, without the
     drive's part) reduces them by F~ and R~. They act on the pulleys with their levers, front and rear.
 
     Attributes:
@@ -55,7 +55,8 @@ class ContactSums(eqx.Module):
         front: moments of F and R on the driving pulley [N·m].
         guide_front, guide_rear: moments of R's share on the guide, on both pulleys, for a friction coefficient of 1
             [N·m].
-        fallen_x, fallen_z, fallen_front: F~ and R~ along the ground and off it [N] and on the driving pulley [N·m].
+        reduction_x, reduction_z: F~ along the ground and R~ off it [N].
+        reduction_front: moments of F~ and R~ on the driving pulley [N·m].
         rise, rise_front: rise of F with all sliding speeds [N·s/m], and of its part of `front` [N·s].
     """
 
@@ -66,16 +67,17 @@ class ContactSums(eqx.Module):
     front: Scalar
     guide_front: Scalar
     guide_rear: Scalar
-    fallen_x: Scalar
-    fallen_z: Scalar
-    fallen_front: Scalar
+    reduction_x: Scalar
+    reduction_z: Scalar
+    reduction_front: Scalar
     rise: Scalar
     rise_front: Scalar
 
 
 def contact_inputs(path: BeltPath, chassis: Chassis, adhesion: Any) -> dict[str, Any]:
     """Inputs of the contacts other than the motion, by name. Tangents have the same form (None: constant)."""
-    gear, friction = path.gear, chassis.ground.friction
+    gear = path.gear
+    friction = chassis.ground.friction
     return {
         "pulley": path.radius,
         "adhesion": adhesion,
@@ -86,34 +88,43 @@ def contact_inputs(path: BeltPath, chassis: Chassis, adhesion: Any) -> dict[str,
 
 
 def sums_of_contacts(
-    path: BeltPath, chassis: Chassis, at: ContactState, slip: Scalar, adhesion: Scalar, gained: Float[Array, " 5"]
+    path: BeltPath,
+    chassis: Chassis,
+    contacts: ContactState,
+    slip: Scalar,
+    adhesion: Scalar,
+    velocity_change: Float[Array, " 5"],
 ) -> ContactSums:
-    """The `ContactSums`. `slip` is added to all sliding speeds [m/s]. `gained` is Δv."""
-    sliding = -at.speed_x - slip
+    """The `ContactSums`. `slip` is added to all sliding speeds [m/s]. `velocity_change` is Δv."""
+    sliding = -contacts.speed_x - slip
     ground = chassis.ground
     coefficient = ground.traction(sliding, 1.0, adhesion)
-    rise = ground.traction_rise(sliding, at.force, adhesion)
-    traction = coefficient * at.force
-    front, rear = path.radius * (1 - at.weight), path.radius * at.weight
-    drawn = front * gained[3] + rear * gained[4]
-    along = gained[0] + gained[2] * at.lever_z + at.rate_x * drawn
-    off = at.damped * (gained[1] - gained[2] * at.lever_x + at.rate_z * drawn)
-    fallen = jnp.maximum(rise, 0.0) * along + jnp.where(at.force > 0, coefficient, 0.0) * off
-    net_traction, bears = traction - fallen, at.force - off
-    guided = at.guided * at.force
+    rise = ground.traction_rise(sliding, contacts.force, adhesion)
+    traction = coefficient * contacts.force
+    front, rear = path.radius * (1 - contacts.weight), path.radius * contacts.weight
+    belt_change = front * velocity_change[3] + rear * velocity_change[4]
+    speed_change = velocity_change[0] + velocity_change[2] * contacts.lever_z + contacts.rate_x * belt_change
+    force_drop = contacts.damped * (
+        velocity_change[1] - velocity_change[2] * contacts.lever_x + contacts.rate_z * belt_change
+    )
+    traction_drop = (
+        jnp.maximum(rise, 0.0) * speed_change + jnp.where(contacts.force > 0, coefficient, 0.0) * force_drop
+    )
+    net_traction, net_normal = traction - traction_drop, contacts.force - force_drop
+    guide_load = contacts.guided * contacts.force
     contributions = ContactSums(
         traction=traction,
-        normal=at.force,
-        moment=net_traction * at.lever_z - bears * at.lever_x,
-        rear=(net_traction * at.rate_x + bears * at.rate_z) * rear,
-        front=(traction * at.rate_x + at.force * at.rate_z) * front,
-        guide_front=guided * front,
-        guide_rear=guided * rear,
-        fallen_x=fallen,
-        fallen_z=off,
-        fallen_front=(fallen * at.rate_x + off * at.rate_z) * front,
+        normal=contacts.force,
+        moment=net_traction * contacts.lever_z - net_normal * contacts.lever_x,
+        rear=(net_traction * contacts.rate_x + net_normal * contacts.rate_z) * rear,
+        front=(traction * contacts.rate_x + contacts.force * contacts.rate_z) * front,
+        guide_front=guide_load * front,
+        guide_rear=guide_load * rear,
+        reduction_x=traction_drop,
+        reduction_z=force_drop,
+        reduction_front=(traction_drop * contacts.rate_x + force_drop * contacts.rate_z) * front,
         rise=rise,
-        rise_front=rise * at.rate_x * front,
+        rise_front=rise * contacts.rate_x * front,
     )
     return jax.tree.map(jnp.sum, contributions)
 
@@ -124,17 +135,17 @@ class LinearizedSums(eqx.Module):
     Attributes:
         values: the sums.
         slopes: derivatives of each sum with respect to `names`.
-        at: values of these inputs for the linearization of the sums.
+        point: values of these inputs for the linearization of the sums.
     """
 
     values: ContactSums
     slopes: ContactSums
-    at: Mapping[str, Scalar]
+    point: Mapping[str, Scalar]
     names: tuple[str, ...] = eqx.field(static=True)
 
-    def near(self, now: Mapping[str, Any]) -> ContactSums:
-        """Sums for inputs `now`, to first order. Missing inputs keep their values."""
-        differences = jnp.stack([now[n] - self.at[n] if n in now else jnp.zeros(()) for n in self.names])
+    def near(self, inputs: Mapping[str, Any]) -> ContactSums:
+        """Sums for inputs `inputs`, to first order. Missing inputs keep their values."""
+        differences = jnp.stack([inputs[n] - self.point[n] if n in inputs else jnp.zeros(()) for n in self.names])
         return jax.tree.map(lambda value, slope: value + slope @ differences, self.values, self.slopes)
 
     def slope(self, name: str) -> ContactSums:
@@ -145,42 +156,46 @@ class LinearizedSums(eqx.Module):
 def linearize(
     path: BeltPath,
     chassis: Chassis,
-    given: Mapping[str, Any],
-    gained: Float[Array, " 5"],
+    inputs: Mapping[str, Any],
+    velocity_change: Float[Array, " 5"],
     constants: tuple[str, ...] = (),
 ) -> LinearizedSums:
     """Sums and their derivatives.
 
     Args:
         path, chassis: path and chassis of the run.
-        given: values of `MOTION`, of `contact_inputs` and of `slip`.
-        gained: Δv of the step, constant.
+        inputs: values of `MOTION`, of `contact_inputs` and of `slip`.
+        velocity_change: Δv of the step, constant.
         constants: `contact_inputs` to differentiate with respect to.
     """
     varied = (*MOTION, *constants)
 
     def sums(numbers: Float[Array, " varied"]) -> tuple[ContactSums, ContactSums]:
-        values = {**given, **dict(zip(varied, numbers, strict=True))}
+        values = {**inputs, **dict(zip(varied, numbers, strict=True))}
         gear = replace(path.gear, **{name: values[name] for name in GEAR})
         ground = chassis.ground
         friction = replace(ground.friction, **{name: values[f"friction_{name}"] for name in FRICTION})
         ground = replace(ground, friction=friction)
-        changed = {name: values[f"chassis_{name}"] for name in CHASSIS}
-        path_now = BeltPath(values["pulley"], gear)
-        chassis_now = replace(chassis, ground=ground, **changed)
+        chassis_values = {name: values[f"chassis_{name}"] for name in CHASSIS}
+        varied_path = BeltPath(values["pulley"], gear)
+        varied_chassis = replace(chassis, ground=ground, **chassis_values)
         z, pitch, front, rear, *v = (values[name] for name in MOTION)
-        touching = compute_contacts(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
-        return (sums_of_contacts(path_now, chassis_now, touching, values["slip"], values["adhesion"], gained),) * 2
+        contacts = compute_contacts(varied_path, varied_chassis, (0.0, z, pitch, front, rear), v)
+        return (
+            sums_of_contacts(
+                varied_path, varied_chassis, contacts, values["slip"], values["adhesion"], velocity_change
+            ),
+        ) * 2
 
-    slopes, values = jax.jacfwd(sums, has_aux=True)(jnp.stack([jnp.asarray(given[name]) for name in varied]))
+    slopes, values = jax.jacfwd(sums, has_aux=True)(jnp.stack([jnp.asarray(inputs[name]) for name in varied]))
     # Slip shifts the sliding of every contact like the robot's own speed.
     slopes = jax.tree.map(lambda slope: jnp.append(slope, slope[MOTION.index("v_x")]), slopes)
     names = (*varied, "slip")
-    return LinearizedSums(values, slopes, {name: given[name] for name in names}, names)
+    return LinearizedSums(values, slopes, {name: inputs[name] for name in names}, names)
 
 
 class ContactForces(eqx.Module):
-    """Forces of the contacts at an instant, from their sums, see `side_contacts.Pull`."""
+    """Forces of the contacts at an instant, from their sums, see `side_contacts.ContactPull`."""
 
     traction: Scalar
     moment: Scalar
@@ -209,10 +224,11 @@ class SummedContacts(eqx.Module):
 
     def shifted(self, slip: Scalar) -> ContactSums:
         """Sums with `slip` added to the sliding speeds [m/s]."""
-        slip_derivative, was = self.linearized.slope("slip"), self.linearized.values
-        slip_change = slip - self.linearized.at["slip"]
+        slip_derivative = self.linearized.slope("slip")
+        linear_sums = self.linearized.values
+        slip_change = slip - self.linearized.point["slip"]
         sums = jax.tree.map(lambda a, b: a + b * slip_change, self.sums, slip_derivative)
-        rise, rise_front = self.sums.rise - was.rise, self.sums.rise_front - was.rise_front
+        rise, rise_front = self.sums.rise - linear_sums.rise, self.sums.rise_front - linear_sums.rise_front
         return replace(
             sums,
             traction=sums.traction - (rise + slip_derivative.rise * slip_change / 2) * slip_change,
@@ -223,8 +239,13 @@ class SummedContacts(eqx.Module):
         """Forces of the contacts for these signals."""
         sums = self.shifted(signals.speed_slip_terms)
         friction = chassis.track.guide_friction * signals.direction
-        guided = (sums.guide_front + sums.guide_rear) / self.radius
-        load = -(sums.front - friction * sums.guide_front + self.torque_front)
+        guide_load = (sums.guide_front + sums.guide_rear) / self.radius
+        load_torque = -(sums.front - friction * sums.guide_front + self.torque_front)
         return ContactForces(
-            sums.traction, sums.moment, sums.rear - friction * sums.guide_rear, friction * guided, guided, load
+            sums.traction,
+            sums.moment,
+            sums.rear - friction * sums.guide_rear,
+            friction * guide_load,
+            guide_load,
+            load_torque,
         )

@@ -1,7 +1,7 @@
 """Half a robot in motion: its state, all its forces at an instant, one time step, and its start.
 
-MJX computes chassis and pulleys (5 degrees of freedom, `mjcf`). Grousers or wheels, guides and belt (`undercarriage`,
-`belt`) and the drive (`balances`) enter as generalized forces.
+MJX computes chassis and pulleys (5 degrees of freedom, `mjcf`). Grousers or wheels and guides (`side_contacts`), belt
+(`running_gear`) and drive (`balances`) enter as generalized forces.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ SUNK = 1e-16
 SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
 #: Changes of some signals, and their sizes.
 Changes = Sequence[tuple[Scalar, Scalar]]
-#: From the positions of a belt over time and a tree of samples: means of signals (or `balances.Travel`) and of the
-#: guides' load, number of periods averaged, and change and size of three signals.
+#: Function of the positions of a belt over time and a tree of samples. It returns means of signals (or
+#: `balances.Travel`) and of the guides' load, the number of periods averaged, and change and size of three signals.
 Average = Callable[[Array, tuple[Any, Array]], tuple[Any, Array, Array, Changes]]
 
 
@@ -67,7 +67,7 @@ class HalfRobotState(eqx.Module):
     """State of half a robot, which a time step advances.
 
     Attributes:
-        q, v: coordinates and velocities, see `undercarriage`.
+        q, v: coordinates and velocities, see `side_contacts`.
         current: current of one motor [A].
         discharge: charge taken from the battery [C].
         memory: memory of each effect that has one, by name.
@@ -126,30 +126,31 @@ def build_system(robot: Robot, conditions: Conditions, step: Scalar) -> HalfRobo
     half = masses_of_parts(robot, conditions, balances.mass_with_effects(robot, conditions))
     model, data = mjcf.model_template(conditions.turns)
     model = mjcf.member_model(model, mjcf.robot_bodies(robot, half, conditions), conditions.slope, step)
-    path, chassis = BeltPath(robot.radius_pulley, robot.running_gear), robot.chassis(conditions.configuration)
+    path = BeltPath(robot.radius_pulley, robot.running_gear)
+    chassis = robot.chassis(conditions.configuration)
     return HalfRobotSystem(robot, conditions, path, half, chassis, model, data, jnp.asarray(step, float))
 
 
 class _SideContacts(eqx.Module):
     path: BeltPath
-    at: ContactState
+    contacts: ContactState
     height: Scalar
 
     @property
     def normal(self) -> Scalar:
-        return self.at.normal
+        return self.contacts.normal
 
     def pull(self, chassis: Chassis, signals: Signals) -> ContactPull:
-        return side_contacts.contact_forces(self.path, chassis, signals, self.at, self.height)
+        return side_contacts.contact_forces(self.path, chassis, signals, self.contacts, self.height)
 
 
 def instant(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Signals, ContactState, ContactPull]:
     """All signals, contacts and forces of an instant."""
-    touching = side_contacts.compute_contacts(run.path, run.chassis, motion.q, motion.v)
-    signals, pulled = _resolve_signals(
-        run, motion, _SideContacts(run.path, touching, motion.q[1]), motion.v[0], motion.v[3]
+    contacts = side_contacts.compute_contacts(run.path, run.chassis, motion.q, motion.v)
+    signals, contact_forces = _resolve_signals(
+        run, motion, _SideContacts(run.path, contacts, motion.q[1]), motion.v[0], motion.v[3]
     )
-    return signals, touching, pulled
+    return signals, contacts, contact_forces
 
 
 def _resolve_signals(
@@ -166,34 +167,40 @@ def _loss_derivatives(run: HalfRobotSystem, motion: HalfRobotState, mover: balan
     respect to the speed of the driving shaft [N·m·s]. Negative ones are set to 0.
     """
 
-    def forward(speed: Scalar) -> Scalar:
-        signals, pulled = _resolve_signals(run, motion, mover, speed, motion.v[3])
-        return pulled.traction - signals.resistance
+    def longitudinal_force(speed: Scalar) -> Scalar:
+        signals, contact_forces = _resolve_signals(run, motion, mover, speed, motion.v[3])
+        return contact_forces.traction - signals.resistance
 
-    def shaft(speed: Scalar) -> Scalar:
+    def shaft_torque(speed: Scalar) -> Scalar:
         return _resolve_signals(run, motion, mover, motion.v[0], speed)[0].torque_net
 
     one = jnp.ones_like(motion.v[0])
-    fall_x, fall_shaft = (jax.jvp(f, (motion.v[k],), (one,))[1] for f, k in ((forward, 0), (shaft, 3)))
-    return jnp.maximum(-fall_x, 0.0), jnp.maximum(-fall_shaft, 0.0)
+    force_slope, torque_slope = (
+        jax.jvp(f, (motion.v[k],), (one,))[1] for f, k in ((longitudinal_force, 0), (shaft_torque, 3))
+    )
+    return jnp.maximum(-force_slope, 0.0), jnp.maximum(-torque_slope, 0.0)
 
 
 def generalized_forces(
-    run: HalfRobotSystem, signals: Signals, pulled: ContactPull
+    run: HalfRobotSystem, signals: Signals, contact_forces: ContactPull
 ) -> tuple[Coordinates, Coordinates]:
     """Generalized forces on q [N, N·m], and inertia of the armature at each joint [kg·m²], eq. (31)."""
-    force = jnp.insert(pulled.generalized, 3, signals.torque_net)
+    force = jnp.insert(contact_forces.generalized, 3, signals.torque_net)
     return force, jnp.zeros_like(force).at[3].set(armature_inertia(run, signals))
 
 
 def armature_inertia(run: HalfRobotSystem, signals: Signals) -> Any:
     """Inertia of the armature at the driving shaft [kg·m²], eq. (31)."""
-    motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
-    return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
+    rotor_inertia, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
+    return inertia_reduced(rotor_inertia, ratio, signals.efficiency_load, signals.inertia_added)
 
 
 def damping_matrix(
-    run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, at: ContactState, pulled: ContactPull
+    run: HalfRobotSystem,
+    motion: HalfRobotState,
+    signals: Signals,
+    contacts: ContactState,
+    contact_forces: ContactPull,
 ) -> Float[Array, "5 5"]:
     """Damping matrix K of a step: decrease of the forces on v with v.
 
@@ -202,23 +209,23 @@ def damping_matrix(
     v. Friction that falls with sliding, beyond V_s, is an instability of the robot and not of the step. It is left
     out. The drive's losses and the resistance of the ground rise steeply from rest and are on K's diagonal.
     """
-    losses = _loss_derivatives(run, motion, _SideContacts(run.path, at, motion.q[1]))
-    sliding = side_contacts.sliding_speeds(signals, at)
-    rises = jnp.maximum(run.chassis.ground.traction_rise(sliding, at.force, signals.adhesion), 0.0)
-    front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
-    one, none = jnp.ones_like(rises), jnp.zeros_like(rises)
-    along = jnp.stack([one, none, at.lever_z, at.rate_x * front, at.rate_x * rear], axis=1)
-    off = jnp.stack([none, one, -at.lever_x, at.rate_z * front, at.rate_z * rear], axis=1)
-    none = jnp.zeros_like(losses[0])
-    diagonal = jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
-    return contact_damping(along, off, pulled.force, at.force, rises, at.damped) + diagonal
+    losses = _loss_derivatives(run, motion, _SideContacts(run.path, contacts, motion.q[1]))
+    sliding = side_contacts.sliding_speeds(signals, contacts)
+    rises = jnp.maximum(run.chassis.ground.traction_rise(sliding, contacts.force, signals.adhesion), 0.0)
+    front, rear = run.path.radius * (1 - contacts.weight), run.path.radius * contacts.weight
+    one, zero = jnp.ones_like(rises), jnp.zeros_like(rises)
+    along = jnp.stack([one, zero, contacts.lever_z, contacts.rate_x * front, contacts.rate_x * rear], axis=1)
+    off = jnp.stack([zero, one, -contacts.lever_x, contacts.rate_z * front, contacts.rate_z * rear], axis=1)
+    zero = jnp.zeros_like(losses[0])
+    diagonal = jnp.diag(jnp.stack([losses[0], zero, zero, losses[1], zero]))
+    return contact_damping(along, off, contact_forces.force, contacts.force, rises, contacts.damped) + diagonal
 
 
 def _explicit_step(
-    run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, pulled: ContactPull
+    run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, contact_forces: ContactPull
 ) -> tuple[Coordinates, Float[Array, "5 5"]]:
     """Velocities after one explicit step, and the mass matrix."""
-    force, armature = generalized_forces(run, signals, pulled)
+    force, armature = generalized_forces(run, signals, contact_forces)
     data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
     model = run.model.replace(dof_armature=armature)
     data = mjx.step(model, data)
@@ -227,8 +234,8 @@ def _explicit_step(
 
 def mass_matrix(run: HalfRobotSystem, motion: HalfRobotState) -> Float[Array, "5 5"]:
     """Mass matrix M on v, including the rotors' armature [kg, kg·m, kg·m²]."""
-    signals, _, pulled = instant(run, motion)
-    return _explicit_step(run, motion, signals, pulled)[1]
+    signals, _, contact_forces = instant(run, motion)
+    return _explicit_step(run, motion, signals, contact_forces)[1]
 
 
 class _StepFactors(eqx.Module):
@@ -239,20 +246,27 @@ class _StepFactors(eqx.Module):
     guided: Scalar
     damping: Float[Array, "5 5"]
     factors: Factors
-    gained: Coordinates
+    velocity_change: Coordinates
     slip: Scalar
 
 
 def _implicit_step(run: HalfRobotSystem, motion: HalfRobotState) -> _StepFactors:
-    signals, touching, pulled = instant(run, motion)
-    pushed, mass = _explicit_step(run, motion, signals, pulled)
-    damping = damping_matrix(run, motion, signals, touching, pulled)
+    signals, contacts, contact_forces = instant(run, motion)
+    explicit_velocity, mass = _explicit_step(run, motion, signals, contact_forces)
+    damping = damping_matrix(run, motion, signals, contacts, contact_forces)
     factors = factorise(mass + run.step * damping)
-    gained = solve_factorised(factors, mass @ (pushed - motion.v))
+    velocity_change = solve_factorised(factors, mass @ (explicit_velocity - motion.v))
     after, signals_of_step = _state_after_motion(
-        motion, run.step, other_states_after_step(run, motion, signals), damping @ gained, gained, signals
+        motion,
+        run.step,
+        other_states_after_step(run, motion, signals),
+        damping @ velocity_change,
+        velocity_change,
+        signals,
     )
-    return _StepFactors(after, signals_of_step, pulled.guided, damping, factors, gained, signals.speed_slip_terms)
+    return _StepFactors(
+        after, signals_of_step, contact_forces.guided, damping, factors, velocity_change, signals.speed_slip_terms
+    )
 
 
 def other_states_after_step(
@@ -269,12 +283,17 @@ def other_states_after_step(
 
 
 def _state_after_motion(
-    motion: HalfRobotState, step: Scalar, later: tuple[Any, ...], fallen: Array, gained: Array, signals: Signals
+    motion: HalfRobotState,
+    step: Scalar,
+    other_states: tuple[Any, ...],
+    damping_force: Array,
+    velocity_change: Array,
+    signals: Signals,
 ) -> tuple[HalfRobotState, Signals]:
-    v = motion.v + gained
-    after = HalfRobotState(motion.q + step * v, v, *later)
-    traction, normal = signals.traction - fallen[0], signals.normal - fallen[1]
-    return after, replace(signals, traction=traction, normal=normal, acceleration=gained[0] / step)
+    v = motion.v + velocity_change
+    after = HalfRobotState(motion.q + step * v, v, *other_states)
+    traction, normal = signals.traction - damping_force[0], signals.normal - damping_force[1]
+    return after, replace(signals, traction=traction, normal=normal, acceleration=velocity_change[0] / step)
 
 
 @eqx.filter_custom_jvp
@@ -310,31 +329,33 @@ def _differentiated(
     constants = contact_sums.contact_inputs(d_run.path, d_run.chassis, d_run.conditions.adhesion)
     differentiated = tuple(name for name, change in constants.items() if change is not None)
     contact_inputs = _contact_inputs(run, motion) | {"slip": step.slip}
-    linearized = contact_sums.linearize(run.path, run.chassis, contact_inputs, step.gained, differentiated)
-    (residual, fallen, later, signals, _), d_residual = eqx.filter_jvp(
-        lambda run, motion: _step_residual(run, motion, step.gained, linearized), (run, motion), (d_run, d_motion)
+    linearized = contact_sums.linearize(run.path, run.chassis, contact_inputs, step.velocity_change, differentiated)
+    (residual, damping_force, other_states, signals, _), d_residual = eqx.filter_jvp(
+        lambda run, motion: _step_residual(run, motion, step.velocity_change, linearized),
+        (run, motion),
+        (d_run, d_motion),
     )
-    d_left, d_fallen, d_later, d_signals, d_guided = d_residual
+    d_momentum, d_damping_force, d_other_states, d_signals, d_guided = d_residual
     # None: the differentiated quantity does not enter.
-    d_gained = jnp.zeros_like(residual) if d_left is None else solve_factorised(step.factors, d_left)
-    through = step.damping[:2] @ d_gained
-    d_fallen = through if d_fallen is None else d_fallen + through
+    d_velocity_change = jnp.zeros_like(residual) if d_momentum is None else solve_factorised(step.factors, d_momentum)
+    damping_of_change = step.damping[:2] @ d_velocity_change
+    d_damping_force = damping_of_change if d_damping_force is None else d_damping_force + damping_of_change
     _, (d_after, d_signals_of_step) = eqx.filter_jvp(
         _state_after_motion,
-        (motion, run.step, later, fallen, step.gained, signals),
-        (d_motion, d_run.step, d_later, d_fallen, d_gained, d_signals),
+        (motion, run.step, other_states, damping_force, step.velocity_change, signals),
+        (d_motion, d_run.step, d_other_states, d_damping_force, d_velocity_change, d_signals),
     )
     return (step.after, step.signals, step.guided), (d_after, d_signals_of_step, d_guided)
 
 
 def _contact_inputs(run: HalfRobotSystem, motion: HalfRobotState) -> dict[str, Scalar]:
     """Inputs of the contacts, by name."""
-    moving = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
-    return moving | contact_sums.contact_inputs(run.path, run.chassis, run.conditions.adhesion)
+    motion_inputs = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
+    return motion_inputs | contact_sums.contact_inputs(run.path, run.chassis, run.conditions.adhesion)
 
 
 def _step_residual(
-    run: HalfRobotSystem, motion: HalfRobotState, gained: Coordinates, linearized: LinearizedSums
+    run: HalfRobotSystem, motion: HalfRobotState, velocity_change: Coordinates, linearized: LinearizedSums
 ) -> tuple[Array, Array, tuple[Any, ...], Signals, Scalar]:
     """Residual of a time step at constant Δv, K Δv of x and z, and the other results of the step.
 
@@ -344,29 +365,40 @@ def _step_residual(
     belt = belt_runs(run.path, (q[3], q[4]), (v[3], v[4]))
     sums = linearized.near(_contact_inputs(run, motion))
     mover = contact_sums.SummedContacts(linearized, sums, run.path.radius, belt.torque_front)
-    signals, drawn = _resolve_signals(run, motion, mover, v[0], v[3])
+    signals, contact_forces = _resolve_signals(run, motion, mover, v[0], v[3])
     sums = mover.shifted(signals.speed_slip_terms)
-    losses = [loss * gained[k] for k, loss in zip((0, 3), _loss_derivatives(run, motion, mover), strict=True)]
+    losses = [
+        loss * velocity_change[k] for k, loss in zip((0, 3), _loss_derivatives(run, motion, mover), strict=True)
+    ]
     force = jnp.stack(
         [
-            drawn.traction - signals.resistance - sums.fallen_x - losses[0],
-            sums.normal - sums.fallen_z,
-            drawn.moment + signals.resistance * q[1],
-            signals.torque_net - sums.fallen_front - losses[1],
-            drawn.rear + belt.torque_rear,
+            contact_forces.traction - signals.resistance - sums.reduction_x - losses[0],
+            sums.normal - sums.reduction_z,
+            contact_forces.moment + signals.resistance * q[1],
+            signals.torque_net - sums.reduction_front - losses[1],
+            contact_forces.rear + belt.torque_rear,
         ]
     )
-    gear, spins = run.path.gear, armature_inertia(run, signals)
-    spent = mjcf.step_impulse(run.half, gear.wheelbase, run.conditions, q[2], v[2], spins, gained, run.step)
-    fallen = jnp.stack([sums.fallen_x + losses[0], sums.fallen_z])
-    return run.step * force - spent, fallen, other_states_after_step(run, motion, signals), signals, drawn.guided
+    gear = run.path.gear
+    armature = armature_inertia(run, signals)
+    impulse = mjcf.step_impulse(
+        run.half, gear.wheelbase, run.conditions, q[2], v[2], armature, velocity_change, run.step
+    )
+    damping_force = jnp.stack([sums.reduction_x + losses[0], sums.reduction_z])
+    return (
+        run.step * force - impulse,
+        damping_force,
+        other_states_after_step(run, motion, signals),
+        signals,
+        contact_forces.guided,
+    )
 
 
 def tipping_margin(run: HalfRobotSystem) -> Scalar:
     """Distance of the line of gravity inside the outermost contacts [m]. Negative: the robot tips."""
     forward, up, _ = centre_of_mass(run)
-    meets = forward - jnp.tan(run.conditions.slope) * (up + axle_height(run))
-    return run.path.gear.wheelbase / 2 - jnp.abs(meets)
+    foot = forward - jnp.tan(run.conditions.slope) * (up + axle_height(run))
+    return run.path.gear.wheelbase / 2 - jnp.abs(foot)
 
 
 def centre_of_mass(run: HalfRobotSystem) -> tuple[Scalar, Scalar, Scalar]:
@@ -380,8 +412,8 @@ def axle_height(run: HalfRobotSystem) -> Scalar:
     return jnp.where(run.chassis.on_tracks > 0.5, tracked, run.chassis.radius)
 
 
-def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
-    """At rest on the ground, with its weight on the contacts: a root in height and pitch.
+def stand(run: HalfRobotSystem, pulley_angle: Scalar = 0.0) -> HalfRobotState:
+    """Initial motion: at rest, with the weight on the contacts: a root in height and pitch.
 
     The search starts with every contact that could carry load touching, because from there it does not overshoot.
     `newton.root` takes 0.14 times the time of the 30 steps of a loop of our own (256 runs, 2026-11-28). Optimistix's
@@ -389,60 +421,63 @@ def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
     just touching.
 
     Args:
-        turned: angle of both pulleys [rad], which gives the position of the belt.
+        pulley_angle: angle of both pulleys [rad], which gives the position of the belt.
     """
-    forward, up, total = centre_of_mass(run)
-    weight = total * GRAVITY
+    forward, up, mass = centre_of_mass(run)
+    weight = mass * GRAVITY
     cos, sin = jnp.cos(run.conditions.slope), jnp.sin(run.conditions.slope)
     axle = axle_height(run)
-    rest = jnp.zeros(5, jnp.result_type(axle))
+    at_rest = jnp.zeros(5, jnp.result_type(axle))
 
-    def placed(turned: Scalar, height: Scalar, pitch: Scalar) -> Coordinates:
-        return jnp.zeros_like(rest).at[3:5].set(turned).at[1].set(height).at[2].set(pitch)
+    def coordinates(pulley_angle: Scalar, height: Scalar, pitch: Scalar) -> Coordinates:
+        return jnp.zeros_like(at_rest).at[3:5].set(pulley_angle).at[1].set(height).at[2].set(pitch)
 
-    def unbalanced(y: Vector, _: None, given: tuple[Any, ...]) -> Vector:
-        path, chassis, pulley_angle, weight, forward, up, axle, cos, sin = given
-        touching = side_contacts.compute_contacts(
-            path, chassis, placed(pulley_angle, axle - y[0], y[1]), jnp.zeros_like(rest)
+    def imbalance(y: Vector, _: None, inputs: tuple[Any, ...]) -> Vector:
+        path, chassis, pulley_angle, weight, forward, up, axle, cos, sin = inputs
+        contacts = side_contacts.compute_contacts(
+            path, chassis, coordinates(pulley_angle, axle - y[0], y[1]), jnp.zeros_like(at_rest)
         )
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(
-            touching.force * touching.lever_x
+            contacts.force * contacts.lever_x
         )
-        return (touching.normal - weight * cos) / weight, moment / weight
+        return (contacts.normal - weight * cos) / weight, moment / weight
 
     recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
-    contact_geometry = run.path, run.chassis, turned, weight, forward, up, axle, cos, sin
-    (sunk, pitch), _ = root(unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, contact_geometry, SUNK, None)
-    stays_upright = tipping_margin(run) > 0
-    q = placed(turned, axle - jnp.where(stays_upright, sunk, 0.0), jnp.where(stays_upright, pitch, 0.0))
+    contact_geometry = run.path, run.chassis, pulley_angle, weight, forward, up, axle, cos, sin
+    (sinkage, pitch), _ = root(imbalance, (2e-4 + recess, jnp.zeros_like(recess)), None, contact_geometry, SUNK, None)
+    is_stable = tipping_margin(run) > 0
+    q = coordinates(pulley_angle, axle - jnp.where(is_stable, sinkage, 0.0), jnp.where(is_stable, pitch, 0.0))
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
-    return HalfRobotState(q, rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
+    return HalfRobotState(q, at_rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
 
 
 def roll(run: HalfRobotSystem) -> HalfRobotState:
-    """Rolling on its contacts at the speed of the steady fidelity, or at the no-load speed if it has none.
+    """Initial motion: rolling at the speed of the steady fidelity, or at the no-load speed if there is none.
 
     Derivatives pass through it, so that the derivatives of a short run include its start.
     """
     start = stand(run)
-    guess = steady(run.robot, run.conditions)
-    solved = is_done(guess.status) | (guess.status == ROLLS_BACK)
-    ratio, radius = run.robot.gearbox.ratio, run.chassis.radius
-    no_load = voltage_at_rest(run.robot, run.conditions) / run.robot.motor.torque_constant
-    speed_wheel = guess.theoretical_speed / radius  # the reading may include a sensor's error
-    motor = jnp.where(solved, ratio * speed_wheel, no_load)
-    speed = jnp.where(solved, guess.theoretical_speed * (1 - guess.slip), radius * no_load / ratio)
-    current = jnp.where(solved, guess.reading["total_current"] / run.robot.sides, 0.0)
-    v = jnp.zeros(5, start.q.dtype).at[0].set(speed).at[3:5].set(motor / ratio)
+    steady_travel = steady(run.robot, run.conditions)
+    is_travelling = is_done(steady_travel.status) | (steady_travel.status == ROLLS_BACK)
+    ratio = run.robot.gearbox.ratio
+    radius = run.chassis.radius
+    no_load_speed = voltage_at_rest(run.robot, run.conditions) / run.robot.motor.torque_constant
+    speed_wheel = steady_travel.theoretical_speed / radius  # the reading may include a sensor's error
+    motor_speed = jnp.where(is_travelling, ratio * speed_wheel, no_load_speed)
+    speed = jnp.where(
+        is_travelling, steady_travel.theoretical_speed * (1 - steady_travel.slip), radius * no_load_speed / ratio
+    )
+    current = jnp.where(is_travelling, steady_travel.reading["total_current"] / run.robot.sides, 0.0)
+    v = jnp.zeros(5, start.q.dtype).at[0].set(speed).at[3:5].set(motor_speed / ratio)
     start = replace(start, v=v, current=current)
     signals, _, _ = instant(run, start)  # memories of effects are settled too
     memory = {e.name: e.settled(run.robot, signals) * jnp.ones_like(current) for e in run.robot.remembering}
     return replace(start, memory=memory)
 
 
-def loads(run: HalfRobotSystem, at: ContactState, pulled: ContactPull) -> GearReactions:
+def loads(run: HalfRobotSystem, contacts: ContactState, contact_forces: ContactPull) -> GearReactions:
     """Loads inside the running gear at an instant."""
-    return side_contacts.inner_loads(run.path, at, pulled)
+    return side_contacts.inner_loads(run.path, contacts, contact_forces)
 
 
 def distance_and_reactions(q: Array, reactions: GearReactions) -> tuple[Array, GearReactions | None]:
@@ -450,11 +485,11 @@ def distance_and_reactions(q: Array, reactions: GearReactions) -> tuple[Array, G
     return q[..., 0], reactions
 
 
-def steady_averages(average: Average, travelled: Array, passed: Any, guided: Array) -> SteadyAverages:
+def steady_averages(average: Average, travelled: Array, samples: Any, guide_loads: Array) -> SteadyAverages:
     """Averages at the end of a run, from its record."""
-    signals, load, periods, changes = average(travelled, (passed, guided))
+    signals, guide_load, periods, changes = average(travelled, (samples, guide_loads))
     return SteadyAverages(
-        signals, load / jnp.maximum(signals.normal, 1e-9), periods, jnp.max(relative_changes(changes))
+        signals, guide_load / jnp.maximum(signals.normal, 1e-9), periods, jnp.max(relative_changes(changes))
     )
 
 
@@ -467,7 +502,8 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     """Status of a run from its averages and its last motion."""
     robot, conditions, signals = run.robot, run.conditions, averages.signals
     status = jnp.where(averages.change > SETTLED, NOT_SETTLED, travel_status(signals.speed, signals.voltage))
-    sense, speed_still = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    sense = travel_direction(robot, conditions)
+    speed_still = robot.chassis(conditions.configuration).speed_still
     at_rest = is_at_rest(
         sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, speed_still
     )
@@ -497,12 +533,12 @@ def status_unless_lost(
         tilt: tilt of the robot, at least 0 [rad].
         current: current of the motors [A].
     """
-    level = axle_height(run)
-    finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(current)
+    axle = axle_height(run)
+    is_finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(current)
     is_overturned = (tilt > OVER) & (tilt < 2 * jnp.pi)
-    status = jnp.where(is_overturned & (jnp.abs(height) < HIGH * level), TIPS, status)
-    grounded = (jnp.abs(height - level) < 0.5 * level) & (tilt < OVER)
-    return jnp.where(finite & (grounded | (status == TIPS)), status, FAILED)
+    status = jnp.where(is_overturned & (jnp.abs(height) < HIGH * axle), TIPS, status)
+    is_on_ground = (jnp.abs(height - axle) < 0.5 * axle) & (tilt < OVER)
+    return jnp.where(is_finite & (is_on_ground | (status == TIPS)), status, FAILED)
 
 
 def result_of(run: HalfRobotSystem, averages: SteadyAverages, status: Array) -> Result:

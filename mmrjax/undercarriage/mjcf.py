@@ -67,36 +67,38 @@ def robot_bodies(robot: Robot, half: HalfRobotMasses, conditions: Conditions) ->
     wide as the distance of the tracks, and the parts of the sides at their positions. At least that of a flat robot
     with this yaw and pitch.
     """
-    zero, base = jnp.zeros_like(half.chassis), robot.running_gear.wheelbase
-    ends = (("driving", base / 2), ("driven", -base / 2))
+    zero = jnp.zeros_like(half.chassis)
+    wheelbase = robot.running_gear.wheelbase
+    ends = (("driving", wheelbase / 2), ("driven", -wheelbase / 2))
     if not conditions.turns:
         names = tuple(name for name, _ in ends)
-        mass, turning = [half.chassis, half.pulley, half.pulley], [half.inertia] + [half.inertia_pulley] * 2
-        inertia = jnp.stack([jnp.stack([x] * 3) for x in turning])
+        mass = [half.chassis, half.pulley, half.pulley]
+        pitch_inertias = [half.inertia] + [half.inertia_pulley] * 2
+        inertia = jnp.stack([jnp.stack([x] * 3) for x in pitch_inertias])
         places = [jnp.stack([x + zero, zero, zero]) for _, x in ends]
     else:
         turning = robot.chassis(conditions.configuration).turning
-        several, half_width = robot.sides / 2, turning.width / 2
-        pulley, spins = several * half.pulley, several * half.inertia_pulley
-        mass = [2 * several * half.chassis] + [pulley] * 4
+        motors_per_side, half_width = robot.sides / 2, turning.width / 2
+        pulley, pulley_inertia = motors_per_side * half.pulley, motors_per_side * half.inertia_pulley
+        mass = [2 * motors_per_side * half.chassis] + [pulley] * 4
         names = tuple(f"{name}_{side}" for side in channels.SIDES for name, _ in ends)
         places = [jnp.stack([x + zero, y * turning.width + zero, zero]) for y in SIDES for _, x in ends]
         centre = half.centre[0]
-        apart = mass[0] * (half.forward - centre) ** 2 + 4 * (
-            spins + pulley * (base**2 / 4 + half_width**2 + centre**2)
+        offset_inertia = mass[0] * (half.forward - centre) ** 2 + 4 * (
+            pulley_inertia + pulley * (wheelbase**2 / 4 + half_width**2 + centre**2)
         )
-        pitch, yaw = 2 * several * half.inertia, turning.inertia - apart
+        pitch, yaw = 2 * motors_per_side * half.inertia, turning.inertia - offset_inertia
         payload = conditions.payload / robot.sides
-        roll = 2 * several * (half.body / 3 + half.chassis - half.body - payload) * half_width**2
-        rows = [jnp.stack([jnp.maximum(roll, yaw - pitch), pitch, yaw])] + [jnp.stack([spins] * 3)] * 4
+        roll = 2 * motors_per_side * (half.body / 3 + half.chassis - half.body - payload) * half_width**2
+        rows = [jnp.stack([jnp.maximum(roll, yaw - pitch), pitch, yaw])] + [jnp.stack([pulley_inertia] * 3)] * 4
         inertia = jnp.stack(rows)
-    half_sizes = jnp.stack([half.forward, zero, half.up])
+    chassis_centre = jnp.stack([half.forward, zero, half.up])
     return ModelBodies(
         ("chassis", *names),
         jnp.stack(mass),
         inertia,
-        jnp.zeros_like(inertia).at[0].set(half_sizes),
-        jnp.stack([jnp.zeros_like(half_sizes), *places]),
+        jnp.zeros_like(inertia).at[0].set(chassis_centre),
+        jnp.stack([jnp.zeros_like(chassis_centre), *places]),
     )
 
 
@@ -111,10 +113,10 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
         step: time step [s].
     """
     gear = robot.running_gear
-    parts = robot_bodies(robot, masses_of_parts(robot, conditions, jnp.asarray(mass)), conditions)
+    bodies = robot_bodies(robot, masses_of_parts(robot, conditions, jnp.asarray(mass)), conditions)
     chassis = robot.chassis(conditions.configuration)
     wheeled = bool(chassis.on_tracks < 0.5)
-    stand = " 0 0 0 0" if conditions.turns else ""
+    further = " 0 0 0 0" if conditions.turns else ""
     radius, base = float(robot.radius_pulley), float(gear.wheelbase)
     axle = float(chassis.radius) if wheeled else radius + float(gear.grouser_height)
     outer = float(chassis.radius) if wheeled else radius
@@ -126,14 +128,14 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
                 ends = f"{side * base / 2:.9g} {y} 0 {float(x):.9g} {y} {float(z):.9g}"
                 levers += f'<geom type="capsule" size="0.012" fromto="{ends}" rgba=".35 .4 .45 1"/>\n      '
     pulleys = ""
-    for k, name in enumerate(parts.names[1:], 1):
+    for k, name in enumerate(bodies.names[1:], 1):
         disc = f'<geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" rgba=".2 .2 .2 1"'
         middles = (0.0,) if conditions.turns else (0.122, -0.122)
         discs = "".join(f'{disc} pos="0 {y} 0"/>\n        ' for y in middles)
         across = 0.019 if conditions.turns else 0.141
         pulleys += f"""
-      <body name="{name}" pos="{_numbers_text(parts.place[k])}">
-        <inertial pos="0 0 0" mass="{float(parts.mass[k]):.17g}" diaginertia="{_numbers_text(parts.inertia[k])}"/>
+      <body name="{name}" pos="{_numbers_text(bodies.place[k])}">
+        <inertial pos="0 0 0" mass="{float(bodies.mass[k]):.17g}" diaginertia="{_numbers_text(bodies.inertia[k])}"/>
         <joint name="{name}" type="hinge" axis="0 1 0"/>
         {discs}<geom type="box" size="{outer:.9g} {across} 0.003" rgba=".8 .8 .2 1"/>
       </body>"""
@@ -143,8 +145,8 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
         for y in (-0.122, 0.122)
         for z in (-radius, radius)
     )
-    titled = f"{'' if conditions.turns else 'half '}robot {robot.configurations.names[int(conditions.configuration)]}"
-    return f"""<mujoco model="{titled}">
+    title = f"{'' if conditions.turns else 'half '}robot {robot.configurations.names[int(conditions.configuration)]}"
+    return f"""<mujoco model="{title}">
   <compiler inertiafromgeom="false"/>
   <option timestep="{step:.9g}" integrator="Euler" gravity="{-GRAVITY * sin:.17g} 0 {-GRAVITY * cos:.17g}">
     <flag contact="disable" constraint="disable" eulerdamp="disable"/>
@@ -156,13 +158,13 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
     <light pos="0 -2 3" dir="0 .5 -1" directional="true"/>
     <geom name="ground" type="plane" size="20 2 .1" rgba=".8 .78 .72 1"/>
     <body name="chassis" pos="0 0 0">
-      <inertial pos="{_numbers_text(parts.centre[0])}" mass="{float(parts.mass[0]):.17g}"
-        diaginertia="{_numbers_text(parts.inertia[0])}"/>
+      <inertial pos="{_numbers_text(bodies.centre[0])}" mass="{float(bodies.mass[0]):.17g}"
+        diaginertia="{_numbers_text(bodies.inertia[0])}"/>
       {joints}<geom type="box" size="{base / 2:.9g} 0.104 0.038" pos="0 0 {0.043 - 0.038:.9g}" rgba=".3 .5 .7 1"/>
       {belts}{levers}{pulleys}
     </body>
   </worldbody>
-  <keyframe><key name="stand" qpos="{"0 0" if conditions.turns else "0"} {axle:.9g} 0 0 0{stand}"/></keyframe>
+  <keyframe><key name="stand" qpos="{"0 0" if conditions.turns else "0"} {axle:.9g} 0 0 0{further}"/></keyframe>
 </mujoco>
 """
 
@@ -176,12 +178,12 @@ def step_impulse(
     wheelbase: Scalar,
     conditions: Conditions,
     pitch: Scalar,
-    rate: Scalar,
-    rotating: Scalar,
-    gained: Float[Array, " 5"],
+    pitch_rate: Scalar,
+    armature: Scalar,
+    velocity_change: Float[Array, " 5"],
     step: Scalar,
 ) -> Float[Array, " 5"]:
-    """Generalized impulse that changes velocities by `gained` in a `step`, M Δv + Δt c, in closed form.
+    """Generalized impulse that changes velocities by `velocity_change` in a `step`, M Δv + Δt c, in closed form.
 
     M is the mass matrix and c the bias (gravity and centrifugal forces) of the model from `mjcf_text`. MJX computes
     them too, but the derivatives of its general tree cost many times as much. No other force depends on v here.
@@ -190,26 +192,27 @@ def step_impulse(
         half, wheelbase: masses of half a robot, and distance between its pulleys.
         conditions: conditions, for their slope.
         pitch: pitch of the chassis [rad].
-        rate: pitch rate [rad/s].
-        rotating: inertia of the armature at its joint [kg·m²].
-        gained: change of the velocities Δv.
+        pitch_rate: pitch rate [rad/s].
+        armature: inertia of the armature at its joint [kg·m²].
+        velocity_change: change of the velocities Δv.
         step: Δt [s].
     """
     cos, sin = cosine(pitch), sine(pitch)
-    ahead = half.chassis * (half.forward * cos + half.up * sin)  # times the mass: the pulleys' parts cancel
-    above = half.chassis * (half.up * cos - half.forward * sin)
-    mass, turning = half.chassis + 2 * half.pulley, half.inertia_pulley
-    pitching = half.pitching(wheelbase)
+    moment_ahead = half.chassis * (half.forward * cos + half.up * sin)  # times the mass: the pulleys' parts cancel
+    moment_above = half.chassis * (half.up * cos - half.forward * sin)
+    mass = half.chassis + 2 * half.pulley
+    pulley_inertia = half.inertia_pulley
+    pitch_inertia = half.inertia_about_middle(wheelbase)
     gravity_x, gravity_z = GRAVITY * jnp.sin(conditions.slope), GRAVITY * jnp.cos(conditions.slope)
-    x, z, turn, front, rear = (gained[k] for k in range(5))
+    x, z, turn, front, rear = (velocity_change[k] for k in range(5))
     return jnp.stack(
         [
-            mass * x + above * turn + step * (mass * gravity_x - ahead * rate**2),
-            mass * z - ahead * turn + step * (mass * gravity_z - above * rate**2),
-            above * x - ahead * z + pitching * turn + turning * (2 * turn + front + rear)
-            + step * (gravity_x * above - gravity_z * ahead),
-            turning * (turn + front) + rotating * front,
-            turning * (turn + rear),
+            mass * x + moment_above * turn + step * (mass * gravity_x - moment_ahead * pitch_rate**2),
+            mass * z - moment_ahead * turn + step * (mass * gravity_z - moment_above * pitch_rate**2),
+            moment_above * x - moment_ahead * z + pitch_inertia * turn + pulley_inertia * (2 * turn + front + rear)
+            + step * (gravity_x * moment_above - gravity_z * moment_ahead),
+            pulley_inertia * (turn + front) + armature * front,
+            pulley_inertia * (turn + rear),
         ]
     )  # fmt: skip
 
@@ -219,8 +222,8 @@ def _template(double: bool, turns: bool) -> tuple[Any, Any]:
     from mmrjax.model.paper_robots import nominal  # for the topology only: every number is replaced per member
 
     with jax.ensure_compile_time_eval():
-        run = Conditions(heading_deg=0.0 if turns else None)
-        model = mujoco.MjModel.from_xml_string(mjcf_text(nominal(), run, 13.1))
+        conditions = Conditions(heading_deg=0.0 if turns else None)
+        model = mujoco.MjModel.from_xml_string(mjcf_text(nominal(), conditions, 13.1))
         return mjx.put_model(model), mjx.make_data(model)
 
 
@@ -229,20 +232,20 @@ def model_template(turns: bool) -> tuple[Any, Any]:
     return _template(jnp.result_type(float) == jnp.float64, turns)
 
 
-def member_model(model: Any, parts: ModelBodies, slope: Scalar, step: Scalar) -> Any:
+def member_model(model: Any, bodies: ModelBodies, slope: Scalar, step: Scalar) -> Any:
     """The MJX `model` with this member's bodies, gravity and time step.
 
     Every constant that the smooth dynamics read and that depends on mass is set here (mujoco issue 1607).
     Derived constants for the constraint solver and the sensors are set only if they are sums.
     """
-    zero = jnp.zeros_like(parts.mass[0])
-    total = jnp.sum(parts.mass)
+    zero = jnp.zeros_like(bodies.mass[0])
+    total = jnp.sum(bodies.mass)
     gravity = -GRAVITY * jnp.stack([jnp.sin(slope), zero, jnp.cos(slope)])
     return model.replace(
-        body_mass=jnp.concatenate([zero[None], parts.mass]),
-        body_subtreemass=jnp.concatenate([jnp.stack([total, total]), parts.mass[1:]]),
-        body_inertia=jnp.concatenate([jnp.zeros((1, 3)), parts.inertia]),
-        body_ipos=jnp.concatenate([jnp.zeros((1, 3)), parts.centre]),
-        body_pos=jnp.concatenate([jnp.zeros((1, 3)), parts.place]),
+        body_mass=jnp.concatenate([zero[None], bodies.mass]),
+        body_subtreemass=jnp.concatenate([jnp.stack([total, total]), bodies.mass[1:]]),
+        body_inertia=jnp.concatenate([jnp.zeros((1, 3)), bodies.inertia]),
+        body_ipos=jnp.concatenate([jnp.zeros((1, 3)), bodies.centre]),
+        body_pos=jnp.concatenate([jnp.zeros((1, 3)), bodies.place]),
         opt=model.opt.replace(gravity=gravity, timestep=jnp.asarray(step)),
     )

@@ -34,14 +34,14 @@ LEAST = 0.01  # [m/s], least V_s for the linear limit
 PROBE = 1e-6  # [s], step for computing rates
 
 
-def step_derivative(run: HalfRobotSystem, at: HalfRobotState) -> Float[Array, "11 11"]:
+def step_derivative(run: HalfRobotSystem, state: HalfRobotState) -> Float[Array, "11 11"]:
     """Derivative of (q, v, current) after one step with respect to (q, v, current), of one run."""
 
-    def after(y: Float[Array, " 11"]) -> Float[Array, " 11"]:
-        next_state, _, _ = advance(run, HalfRobotState(y[:5], y[5:10], y[10], at.discharge, at.memory))
+    def numbers_after(y: Float[Array, " 11"]) -> Float[Array, " 11"]:
+        next_state, _, _ = advance(run, HalfRobotState(y[:5], y[5:10], y[10], state.discharge, state.memory))
         return jnp.concatenate([next_state.q, next_state.v, next_state.current[None]])
 
-    return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, at.current[None]]))
+    return jax.jacfwd(numbers_after)(jnp.concatenate([state.q, state.v, state.current[None]]))
 
 
 @compiled
@@ -50,12 +50,14 @@ def _step_derivatives(
 ) -> Float[Array, "runs starts 11 11"]:
     """Derivatives of (q, v, current) after one step with respect to (q, v, current), standing and rolling."""
 
-    def one(conditions: Conditions, steps: Float[Array, " starts"]) -> Float[Array, "starts 11 11"]:
+    def derivatives_of_run(conditions: Conditions, steps: Float[Array, " starts"]) -> Float[Array, "starts 11 11"]:
         run = build_system(robot, conditions, PROBE)
-        starts = jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run))
-        return jax.vmap(lambda at, step: step_derivative(build_system(robot, conditions, step), at))(starts, steps)
+        states = jax.tree.map(lambda *state: jnp.stack(state), stand(run), roll(run))
+        return jax.vmap(lambda state, step: step_derivative(build_system(robot, conditions, step), state))(
+            states, steps
+        )
 
-    return jax.vmap(one)(conditions, steps)
+    return jax.vmap(derivatives_of_run)(conditions, steps)
 
 
 def _roll_period(robot: Robot, conditions: Conditions) -> Scalar:
@@ -76,24 +78,26 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
     ratio of the frequencies of rolling and bouncing on its contacts.
     """
     if conditions.turns:
-        slower = np.asarray(jax.vmap(lambda c: _roll_period(robot, c))(conditions))
-        return np.minimum(slower, 1.0) * largest_step(robot, conditions.straight())
-    laws = [p for p in params.walk_parameters(robot) if p.name.endswith("ground.friction.speed_static")]
-    robot = params.without_weak_types(params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in laws}))
+        period_ratio = np.asarray(jax.vmap(lambda c: _roll_period(robot, c))(conditions))
+        return np.minimum(period_ratio, 1.0) * largest_step(robot, conditions.straight())
+    speed_parameters = [p for p in params.walk_parameters(robot) if p.name.endswith("ground.friction.speed_static")]
+    robot = params.without_weak_types(
+        params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in speed_parameters})
+    )
 
-    def maps(steps: Float[np.ndarray, "runs starts"]) -> Float[np.ndarray, "runs starts 11 11"]:
-        transition_maps = np.asarray(_step_derivatives(robot, conditions, jnp.asarray(steps)))
-        usable = np.isfinite(transition_maps).all(axis=(-2, -1), keepdims=True)
-        return np.where(usable, transition_maps, 0.0)
+    def transition_matrices(steps: Float[np.ndarray, "runs starts"]) -> Float[np.ndarray, "runs starts 11 11"]:
+        matrices = np.asarray(_step_derivatives(robot, conditions, jnp.asarray(steps)))
+        is_finite = np.isfinite(matrices).all(axis=(-2, -1), keepdims=True)
+        return np.where(is_finite, matrices, 0.0)
 
     low, high = np.full((*conditions.shape, 2), -7.0), np.full((*conditions.shape, 2), -2.0)  # powers of ten
     # Growth in continuous time (a robot about to tip, friction that falls with speed) does not depend on the step;
     # slow drifts do not either.
-    rates = (maps(np.full_like(low, PROBE)) - np.eye(11)) / PROBE
+    rates = (transition_matrices(np.full_like(low, PROBE)) - np.eye(11)) / PROBE
     physical = 20.0 + 2 * np.maximum(np.linalg.eigvals(rates).real.max(axis=-1), 0.0)
     for _ in range(16):
         middle = (low + high) / 2
-        growth = np.abs(np.linalg.eigvals(maps(10**middle))).max(axis=-1)
+        growth = np.abs(np.linalg.eigvals(transition_matrices(10**middle))).max(axis=-1)
         stable = growth < 1 + physical * 10**middle
         low, high = np.where(stable, middle, low), np.where(stable, high, middle)
     return np.asarray(SAFETY * (10**low).min(axis=1))
@@ -115,16 +119,16 @@ def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: 
     height = float(robot.radius_pulley + gear.grouser_height)  # levers exist only on tracks
     for name, (_, up) in zip(("lever_front", "lever_rear"), lever_tips(gear, conditions), strict=True):
         tips = np.ravel(np.asarray(up))
-        tip = float(np.min(tips))
-        if tracked.any() and tip < -height:
-            of_run = f"levers_{name.removeprefix('lever_')}_deg"
-            run_value = getattr(conditions, of_run)
-            stands = (
-                np.degrees(float(getattr(gear, name))) if run_value is None else np.ravel(run_value)[np.argmin(tips)]
+        lowest_tip = float(np.min(tips))
+        if tracked.any() and lowest_tip < -height:
+            condition_name = f"levers_{name.removeprefix('lever_')}_deg"
+            stated = getattr(conditions, condition_name)
+            angle_deg = (
+                np.degrees(float(getattr(gear, name))) if stated is None else np.ravel(stated)[np.argmin(tips)]
             )
-            name = name if run_value is None else of_run
+            name = name if stated is None else condition_name
             raise ValueError(
-                f"{name}: got {stands:.0f} deg, its tip {1e3 * (-tip - height):.0f} mm below the ground; "
+                f"{name}: got {angle_deg:.0f} deg, its tip {1e3 * (-lowest_tip - height):.0f} mm below the ground; "
                 "expected both tips above the ground"
             )
     limits = largest_step(robot, conditions)
@@ -132,11 +136,11 @@ def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: 
     if step > limits[worst]:
         raise ValueError(
             f"step: got {step:g} s; the largest stable step is {limits[worst]:.2g} s (run {worst + 1} of "
-            f"{len(limits)}); take {_whole(sample, limits[worst]):g} s, a softer contact or a larger V_s"
+            f"{len(limits)}); take {_step_that_divides(sample, limits[worst]):g} s, a softer contact or a larger V_s"
         )
 
 
-def _whole(sample: float, limit: float) -> float:
+def _step_that_divides(sample: float, limit: float) -> float:
     # The largest step up to `limit` that divides `sample` and can be written with six digits.
     count = math.ceil(sample / limit)
     while abs(float(f"{sample / count:.6g}") * count / sample - 1) > 1e-12:
@@ -213,17 +217,17 @@ def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> l
 def _linearised_steps(
     robot: Robot, conditions: Conditions, positions: int
 ) -> tuple[Float[Array, "runs positions 11 11"], Float[Array, "runs positions 5 5"]]:
-    def one(conditions: Conditions) -> tuple[Array, Array]:
+    def linearise(conditions: Conditions) -> tuple[Array, Array]:
         run = build_system(robot, conditions, PROBE)
         rolling = roll(run)
 
-        def at(turned: Array) -> tuple[Array, Array]:
-            motion = eqx.tree_at(lambda m: m.q, rolling, stand(run, turned).q)
+        def linearise_at(pulley_angle: Array) -> tuple[Array, Array]:
+            motion = eqx.tree_at(lambda m: m.q, rolling, stand(run, pulley_angle).q)
             return (step_derivative(run, motion) - jnp.eye(11)) / PROBE, mass_matrix(run, motion)
 
-        return jax.vmap(at)(jnp.arange(positions) / positions * run.path.pitch / run.path.radius)
+        return jax.vmap(linearise_at)(jnp.arange(positions) / positions * run.path.pitch / run.path.radius)
 
-    return jax.vmap(one)(conditions)
+    return jax.vmap(linearise)(conditions)
 
 
 def _run_modes(rates: Float[np.ndarray, "positions 11 11"], masses: Float[np.ndarray, "positions 5 5"]) -> list[Mode]:
@@ -233,17 +237,18 @@ def _run_modes(rates: Float[np.ndarray, "positions 11 11"], masses: Float[np.nda
         if not np.isfinite(rate).all():
             continue
         values, vectors = np.linalg.eig(rate)
-        swings = (values.imag > 0) & (-values.real < _SWINGS * np.abs(values))
-        velocity = vectors[5:10, swings]
+        is_oscillating = (values.imag > 0) & (-values.real < _SWINGS * np.abs(values))
+        velocity = vectors[5:10, is_oscillating]
         energy = np.abs(np.real(velocity.conj() * (mass @ velocity)))
         shares = (energy / energy.sum(axis=0)).T
         for k, name in zip(*linear_sum_assignment(-shares), strict=True):
-            modes_by_name.setdefault(NAMES[name], []).append((values[swings][k], shares[k, name]))
-    answer = []
+            modes_by_name.setdefault(NAMES[name], []).append((values[is_oscillating][k], shares[k, name]))
+    modes_of_run = []
     for name, members in modes_by_name.items():
         value, share = np.array([m[0] for m in members]), np.array([m[1] for m in members])
-        damped, size = value.imag / (2 * np.pi), np.abs(value)
-        numbers = (damped.mean(), damped.min(), damped.max(), (size / (2 * np.pi)).mean())
-        ratios = ((-value.real / size).mean(), share.mean(), len(members) / len(rates))
-        answer.append(Mode(name, *map(float, numbers), *map(float, ratios)))
-    return sorted(answer, key=lambda mode: mode.frequency)
+        frequency = value.imag / (2 * np.pi)
+        magnitude = np.abs(value)
+        numbers = (frequency.mean(), frequency.min(), frequency.max(), (magnitude / (2 * np.pi)).mean())
+        ratios = ((-value.real / magnitude).mean(), share.mean(), len(members) / len(rates))
+        modes_of_run.append(Mode(name, *map(float, numbers), *map(float, ratios)))
+    return sorted(modes_of_run, key=lambda mode: mode.frequency)

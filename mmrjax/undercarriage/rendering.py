@@ -54,26 +54,26 @@ class RunScene(NamedTuple):
         from matplotlib.lines import Line2D
 
         time, signals = self.run.time, self.run.signals
-        sheet = Figure(figsize=(9.6, 7.2), dpi=100, layout="constrained")
-        upper, current, speed = sheet.subplots(3, 1, gridspec_kw=dict(height_ratios=[4.6, 1, 1]))
-        draw_sample(upper, self, k)
+        figure = Figure(figsize=(9.6, 7.2), dpi=100, layout="constrained")
+        picture, current, speed = figure.subplots(3, 1, gridspec_kw=dict(height_ratios=[4.6, 1, 1]))
+        draw_sample(picture, self, k)
         span, rise = 0.31, 0.31 * np.sin(abs(self.slope))
-        upper.set(xlim=(-span, span), ylim=(-0.15 - rise * 0.55, 0.16 + rise * 0.55), aspect="equal")
-        upper.axis("off")
-        upper.set_title(
+        picture.set(xlim=(-span, span), ylim=(-0.15 - rise * 0.55, 0.16 + rise * 0.55), aspect="equal")
+        picture.axis("off")
+        picture.set_title(
             f"{self.name}, slope {np.degrees(self.slope):.0f}°, t = {time[k]:.3f} s, x = {self.run.q[k, 0]:.3f} m, "
             f"V = {signals.speed[k]:.2f} m/s",
             fontsize=11,
         )
         legend_entries = [entry for entry in _LEGEND if not (self.wheeled and "guide" in entry[0])]
         handles = [Line2D([], [], color=colour, lw=2.5, label=label) for label, colour in legend_entries]
-        upper.legend(handles=handles, loc="upper left", fontsize=8, frameon=False, ncols=len(legend_entries))
-        foot = -0.14 - rise * 0.5
-        upper.plot([span - 0.02 - 50 * FORCE, span - 0.02], [foot] * 2, color=_INK, lw=2)
-        upper.text(span - 0.02 - 25 * FORCE, foot + 0.004, "50 N", fontsize=8, va="bottom", ha="center")
+        picture.legend(handles=handles, loc="upper left", fontsize=8, frameon=False, ncols=len(legend_entries))
+        scale_height = -0.14 - rise * 0.5
+        picture.plot([span - 0.02 - 50 * FORCE, span - 0.02], [scale_height] * 2, color=_INK, lw=2)
+        picture.text(span - 0.02 - 25 * FORCE, scale_height + 0.004, "50 N", fontsize=8, va="bottom", ha="center")
         current.plot(time, signals.total_current, color=_NORMAL, lw=0.9)
-        top = 1.3 * np.percentile(signals.total_current, 98)
-        current.set(ylabel="I, A", ylim=(0.0, max(top, 0.1)), xlim=(time[0], time[-1]), xticklabels=[])
+        current_most = 1.3 * np.percentile(signals.total_current, 98)
+        current.set(ylabel="I, A", ylim=(0.0, max(current_most, 0.1)), xlim=(time[0], time[-1]), xticklabels=[])
         speed.plot(time, signals.speed_theoretical, color="#888888", lw=0.9, label="theoretical")
         speed.plot(time, signals.speed, color=_TRACTION, lw=1.2, label="robot")
         speed.set(xlabel="time, s", ylabel="V, m/s", xlim=(time[0], time[-1]))
@@ -82,7 +82,7 @@ class RunScene(NamedTuple):
             axes.axvline(time[k], color=_INK, lw=0.8)
             axes.grid(alpha=0.25)
             axes.spines[["top", "right"]].set_visible(False)
-        return sheet
+        return figure
 
 
 def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> RunScene:
@@ -95,7 +95,8 @@ def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> 
     if not np.isfinite(np.asarray(run.q)).all():
         raise ValueError("run: its coordinates are not finite; expected a run that ended")
     chassis = robot.chassis(conditions.configuration)
-    path, wheeled = BeltPath(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
+    path = BeltPath(robot.radius_pulley, gear)
+    wheeled = bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else lever_tips(gear, conditions)
     return RunScene(
         slope=float(conditions.slope),
@@ -122,19 +123,22 @@ def belt_outline(path: BeltPath, height: float, places: np.ndarray) -> np.ndarra
     return np.stack([np.asarray(tips.forward), np.asarray(tips.up)], axis=1)
 
 
-def draw_sample(axes: Any, view: RunScene, k: int) -> None:
+def draw_sample(axes: Any, scene: RunScene, k: int) -> None:
     """Draws sample `k` of a scene into Matplotlib `axes`, uphill to the right."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle, Polygon
 
-    q, radius = view.run.q[k], float(view.path.radius)
-    axle_x, height, place = q[0], q[1], np.asarray(view.run.reactions.place[k])
+    q = scene.run.q[k]
+    radius = float(scene.path.radius)
+    axle_x = q[0]
+    height = q[1]
+    place = np.asarray(scene.run.reactions.place[k])
 
     def world(points: Any) -> np.ndarray:  # chassis frame -> slope -> page
-        return _rotate(_rotate(points, -q[2], (0.0, height)), view.slope)
+        return _rotate(_rotate(points, -q[2], (0.0, height)), scene.slope)
 
     def ground(points: Any) -> np.ndarray:
-        return _rotate(points, view.slope)
+        return _rotate(points, scene.slope)
 
     strip = ground([(-0.6, 0.0), (0.6, 0.0), (0.6, -0.2), (-0.6, -0.2)])
     axes.add_patch(Polygon(strip, color=_GROUND, alpha=0.45, lw=0))
@@ -143,29 +147,29 @@ def draw_sample(axes: Any, view: RunScene, k: int) -> None:
     marks = np.arange(first_mark, axle_x + 0.6, 0.05) - axle_x  # fixed to the ground: they show the travel
     axes.add_collection(LineCollection([ground([(m, 0), (m - 0.008, -0.012)]) for m in marks], colors=_INK, lw=0.8))
 
-    gear = view.path.gear
-    under = float(gear.clearance - view.path.radius - gear.grouser_height)
-    top = under + BODY_HEIGHT
-    body = [(-view.axle, under), (view.axle, under), (view.axle + 0.01, top), (-view.axle - 0.01, top)]
+    gear = scene.path.gear
+    underside = float(gear.clearance - scene.path.radius - gear.grouser_height)
+    top = underside + BODY_HEIGHT
+    body = [(-scene.axle, underside), (scene.axle, underside), (scene.axle + 0.01, top), (-scene.axle - 0.01, top)]
     body = [(x, max(z, -radius + 0.008)) for x, z in body]
     axes.add_patch(Polygon(world(body), facecolor=_BODY, edgecolor=_INK, lw=1, alpha=0.85))
-    for (x, z), start in zip(view.levers, (view.axle, -view.axle), strict=False):
+    for (x, z), start in zip(scene.levers, (scene.axle, -scene.axle), strict=False):
         axes.plot(*world([(start, 0), (x, z)]).T, color="#8fa3b0", lw=7, solid_capstyle="round", alpha=0.7, zorder=2)
-    belt = world(belt_outline(view.path, 0.0, np.linspace(0.0, float(view.path.length), 400)))
+    belt = world(belt_outline(scene.path, 0.0, np.linspace(0.0, float(scene.path.length), 400)))
     axes.plot(*belt.T, color=_BELT, lw=2.2, zorder=3)
-    if view.wheeled:
-        for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
-            _draw_disc(axes, Circle, world, x, view.wheel, phi, "#9aa5ad")
+    if scene.wheeled:
+        for x, phi in ((scene.axle, q[3]), (-scene.axle, q[4])):
+            _draw_disc(axes, Circle, world, x, scene.wheel, phi, "#9aa5ad")
     else:
-        base = world(belt_outline(view.path, 0.0, place))
-        tip = world(belt_outline(view.path, float(view.path.gear.grouser_height), place))
+        base = world(belt_outline(scene.path, 0.0, place))
+        tip = world(belt_outline(scene.path, float(scene.path.gear.grouser_height), place))
         axes.add_collection(LineCollection(list(np.stack([base, tip], axis=1)), colors=_BELT, lw=4, zorder=3))
-    teeth = (place[:, None] + np.arange(7) * float(view.path.pitch) / 7).ravel() % float(view.path.length)
-    root, inner = (world(belt_outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
+    teeth = (place[:, None] + np.arange(7) * float(scene.path.pitch) / 7).ravel() % float(scene.path.length)
+    root, inner = (world(belt_outline(scene.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
     axes.add_collection(LineCollection(list(np.stack([root, inner], axis=1)), colors=_BELT, lw=0.9, zorder=3))
-    for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
+    for x, phi in ((scene.axle, q[3]), (-scene.axle, q[4])):
         _draw_disc(axes, Circle, world, x, radius - 0.003, phi, "#d9dee2")
-    _draw_forces(axes, view, k, ground)
+    _draw_forces(axes, scene, k, ground)
 
 
 def _draw_disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angle: float, colour: str) -> None:
@@ -176,27 +180,29 @@ def _draw_disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angl
         axes.plot(*world(np.array([arm, -arm]) + np.array([x, 0.0])).T, color=_INK, lw=0.8, zorder=4)
 
 
-def _draw_forces(axes: Any, view: RunScene, k: int, ground: Any) -> None:
+def _draw_forces(axes: Any, scene: RunScene, k: int, ground: Any) -> None:
     def arrow(start: Any, along: Any, colour: str) -> None:
         tail, head = ground([start])[0], ground([np.asarray(start) + np.asarray(along) * FORCE])[0]
         if np.hypot(*(head - tail)) > 2e-3:
             style = dict(arrowstyle="-|>", color=colour, lw=1.6, shrinkA=0, shrinkB=0, mutation_scale=9)
             axes.annotate("", head, tail, arrowprops=style, zorder=6)
 
-    q, signals, reactions = view.run.q[k], view.run.signals, view.run.reactions
-    if view.wheeled:
-        for x, force in zip((view.axle, -view.axle), reactions.support[k], strict=True):
+    q = scene.run.q[k]
+    signals = scene.run.signals
+    reactions = scene.run.reactions
+    if scene.wheeled:
+        for x, force in zip((scene.axle, -scene.axle), reactions.support[k], strict=True):
             arrow((x, -force * FORCE), (0.0, force), _NORMAL)
     else:
-        tip = belt_outline(view.path, float(view.path.gear.grouser_height), reactions.place[k])
+        tip = belt_outline(scene.path, float(scene.path.gear.grouser_height), reactions.place[k])
         for j in range(GROUSERS):
             force = reactions.grouser[k, j]
             x = _rotate([tip[j]], -q[2])[0, 0]
             arrow((x, -force * FORCE), (0.0, force), _NORMAL)
-        arrow((-view.axle / 2, 0.012), (0.0, reactions.guided[k].sum()), _GUIDE)
+        arrow((-scene.axle / 2, 0.012), (0.0, reactions.guided[k].sum()), _GUIDE)
     arrow((0.0, -0.012), (signals.traction[k], 0.0), _TRACTION)
     arrow((0.0, -0.024), (-signals.resistance[k], 0.0), _RESISTANCE)
-    down = _rotate([(0.0, -view.weight)], -view.slope)[0]
+    down = _rotate([(0.0, -scene.weight)], -scene.slope)[0]
     arrow((0.0, q[1]), down, _WEIGHT)
 
 

@@ -38,17 +38,17 @@ def measure_ripple(time: Series, values: Series) -> tuple[float, float, float]:
     n = len(detrended)
     lags = np.arange(n // 2)
     with np.errstate(invalid="ignore", divide="ignore"):  # for a constant signal
-        agreement = np.array([np.corrcoef(detrended[: n - k], detrended[k:])[0, 1] for k in lags])
-    inner = agreement[1:-1]
-    peaks = 1 + np.nonzero((inner > agreement[:-2]) & (inner >= agreement[2:]))[0]
+        autocorrelation = np.array([np.corrcoef(detrended[: n - k], detrended[k:])[0, 1] for k in lags])
+    inside = autocorrelation[1:-1]
+    peaks = 1 + np.nonzero((inside > autocorrelation[:-2]) & (inside >= autocorrelation[2:]))[0]
     period = float("nan")
-    good = peaks[agreement[peaks] >= 0.9 * agreement[peaks].max(initial=0.0)]
-    if len(good):
-        fundamental = _parabola_vertex(agreement, good[0])
-        period_counts = np.round(good / fundamental)
-        near = np.abs(good / fundamental - period_counts) < 0.2
-        last = good[near][-1]
-        period = float(_parabola_vertex(agreement, last) / np.round(last / fundamental) * (time[1] - time[0]))
+    candidates = peaks[autocorrelation[peaks] >= 0.9 * autocorrelation[peaks].max(initial=0.0)]
+    if len(candidates):
+        fundamental = _parabola_vertex(autocorrelation, candidates[0])
+        period_counts = np.round(candidates / fundamental)
+        is_multiple = np.abs(candidates / fundamental - period_counts) < 0.2
+        last = candidates[is_multiple][-1]
+        period = float(_parabola_vertex(autocorrelation, last) / np.round(last / fundamental) * (time[1] - time[0]))
     return float(values.mean()), float(np.ptp(detrended) / 2 / abs(values.mean())), period
 
 
@@ -93,10 +93,10 @@ def touchdown_times(
     of the path, or just at the start of it.
     """
     is_loaded = np.asarray(grouser) > 0
-    lands = ~is_loaded[:-1] & is_loaded[1:]
+    is_landing = ~is_loaded[:-1] & is_loaded[1:]
     length = np.asarray(place).max()
     front = (np.asarray(place)[1:] > length / 2) | (np.asarray(place)[1:] < 0.02 * length)
-    return np.sort(np.asarray(time)[1:][np.nonzero(lands & front)[0]])
+    return np.sort(np.asarray(time)[1:][np.nonzero(is_landing & front)[0]])
 
 
 class RippleSignal(NamedTuple):
@@ -144,12 +144,13 @@ def passing_parts(robot: Robot, configuration: int) -> PassingParts:
     """Parts that excite vibrations in a configuration: grousers with pitch S_g on tracks, teeth with S_t on
     wheels.
     """
-    chassis, radius = robot.configurations.members[configuration], float(robot.radius_pulley)
+    chassis = robot.configurations.members[configuration]
+    pulley_radius = float(robot.radius_pulley)
     if float(chassis.on_tracks) > 0.5:
         pitch = float(BeltPath(robot.radius_pulley, robot.running_gear).pitch)
         return PassingParts("grousers", pitch, pitch)
-    pitch = 2 * np.pi * radius / TEETH_PULLEY
-    return PassingParts("teeth", pitch, pitch * float(chassis.radius) / radius)
+    pitch = 2 * np.pi * pulley_radius / TEETH_PULLEY
+    return PassingParts("teeth", pitch, pitch * float(chassis.radius) / pulley_radius)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,7 +187,8 @@ def vibrations_of_runs(robot: Robot, runs: TrackTrajectory, pitch: float) -> Vib
         runs: simulated runs, fields of shape (runs, samples, ...).
         pitch: pitch of the passing parts [m].
     """
-    time, status = np.asarray(runs.time[0]), np.asarray(runs.result.status)
+    time = np.asarray(runs.time[0])
+    status = np.asarray(runs.result.status)
     tail = time > time[-1] - TAIL * (time[-1] - time[0])
     tail_time = time[tail]
     vibrations = {
@@ -252,28 +254,32 @@ def peaks_over_speed(
     """
     if len(speed) < 3:
         return []
-    tops, facts = find_peaks(deviation, prominence=1e-12)
-    widths = peak_widths(deviation, tops, rel_height=0.3)
-    index, answer = np.arange(len(speed)), []
-    for k, top in enumerate(tops):
-        height, rise = float(deviation[top]), float(facts["prominences"][k])
+    maxima, properties = find_peaks(deviation, prominence=1e-12)
+    widths = peak_widths(deviation, maxima, rel_height=0.3)
+    index = np.arange(len(speed))
+    peaks = []
+    for k, maximum in enumerate(maxima):
+        height = float(deviation[maximum])
+        rise = float(properties["prominences"][k])
         if rise < STANDS_OUT * height or height < NOTICEABLE:
             continue
         low, high = (float(np.interp(widths[side][k], index, speed)) for side in (2, 3))
-        ratio = frequency[top] / passing[top]
-        bend, slope, _ = np.polyfit(speed[top - 1 : top + 2] - speed[top], deviation[top - 1 : top + 2], 2)
-        peak_speed = float(np.clip(speed[top] - slope / (2 * bend), low, high))
+        ratio = frequency[maximum] / passing[maximum]
+        curvature, slope, _ = np.polyfit(
+            speed[maximum - 1 : maximum + 2] - speed[maximum], deviation[maximum - 1 : maximum + 2], 2
+        )
+        peak_speed = float(np.clip(speed[maximum] - slope / (2 * curvature), low, high))
         nearest_ratio = round(float(ratio)) if np.isfinite(ratio) else 0
         order = nearest_ratio if nearest_ratio and abs(ratio - nearest_ratio) < _SAME else 0
-        near = [m for m in modes if order and m.resonant and m.band[0] <= frequency[top] <= m.band[1]]
-        mode = min(near, key=lambda m: abs(m.frequency - frequency[top])).name if near else ""
-        answer.append(
-            RipplePeak(signal, payload, peak_speed, low, high, height, rise, order, float(frequency[top]), mode)
+        modes_in_band = [m for m in modes if order and m.resonant and m.band[0] <= frequency[maximum] <= m.band[1]]
+        mode = min(modes_in_band, key=lambda m: abs(m.frequency - frequency[maximum])).name if modes_in_band else ""
+        peaks.append(
+            RipplePeak(signal, payload, peak_speed, low, high, height, rise, order, float(frequency[maximum]), mode)
         )
-    return answer
+    return peaks
 
 
-def drop_unconfirmed_modes(found: Sequence[RipplePeak], modes: Mapping[float, Sequence[Mode]]) -> list[RipplePeak]:
+def drop_unconfirmed_modes(peaks: Sequence[RipplePeak], modes: Mapping[float, Sequence[Mode]]) -> list[RipplePeak]:
     """Peaks in which a mode is removed if the peak does not follow it over the payloads.
 
     If a mode's frequency changes with payload by more than `MOVES`, the lines of the peaks of one order have to
@@ -282,16 +288,18 @@ def drop_unconfirmed_modes(found: Sequence[RipplePeak], modes: Mapping[float, Se
     Args:
         modes: natural vibrations by payload [kg].
     """
-    answer = list(found)
-    for key in dict.fromkeys((p.mode, p.order, p.signal) for p in found if p.mode):
-        alike = [k for k, p in enumerate(found) if (p.mode, p.order, p.signal) == key]
-        natural = np.array([next(m.frequency for m in modes[found[k].payload] if m.name == key[0]) for k in alike])
-        if np.ptp(natural) < MOVES * natural.mean():
+    confirmed = list(peaks)
+    for key in dict.fromkeys((p.mode, p.order, p.signal) for p in peaks if p.mode):
+        members = [k for k, p in enumerate(peaks) if (p.mode, p.order, p.signal) == key]
+        natural_frequencies = np.array(
+            [next(m.frequency for m in modes[peaks[k].payload] if m.name == key[0]) for k in members]
+        )
+        if np.ptp(natural_frequencies) < MOVES * natural_frequencies.mean():
             continue
-        if np.polyfit(natural, [found[k].frequency for k in alike], 1)[0] <= 0:
-            for k in alike:
-                answer[k] = found[k]._replace(mode="")
-    return answer
+        if np.polyfit(natural_frequencies, [peaks[k].frequency for k in members], 1)[0] <= 0:
+            for k in members:
+                confirmed[k] = peaks[k]._replace(mode="")
+    return confirmed
 
 
 class ModeCrossing(NamedTuple):
@@ -311,22 +319,22 @@ class ModeCrossing(NamedTuple):
 
 
 def find_crossings(
-    modes: Sequence[Mode], payload: float, travel: float, slowest: float, fastest: float, found: Sequence[RipplePeak]
+    modes: Sequence[Mode], payload: float, travel: float, slowest: float, fastest: float, peaks: Sequence[RipplePeak]
 ) -> list[ModeCrossing]:
     """Crossings at one payload between two speeds [m/s], and the ripple peaks that confirm them.
 
     Args:
         travel: travel of the robot from one passing to the next [m].
     """
-    answer = []
+    crossings = []
     for mode in modes:
         if not mode.resonant:
             continue
         lowest_order = max(int(np.ceil(mode.frequency * travel / fastest)), 1)
         for order in range(lowest_order, int(mode.frequency * travel / slowest) + 1):
-            shows = tuple(p.signal for p in found if (p.payload, p.mode, p.order) == (payload, mode.name, order))
-            answer.append(ModeCrossing(mode.name, order, payload, mode.frequency * travel / order, shows))
-    return answer
+            signals = tuple(p.signal for p in peaks if (p.payload, p.mode, p.order) == (payload, mode.name, order))
+            crossings.append(ModeCrossing(mode.name, order, payload, mode.frequency * travel / order, signals))
+    return crossings
 
 
 class Resonance(NamedTuple):
@@ -353,27 +361,31 @@ class Resonance(NamedTuple):
     rise: float
 
 
-def group_resonances(found: Sequence[RipplePeak]) -> list[Resonance]:
+def group_resonances(peaks: Sequence[RipplePeak]) -> list[Resonance]:
     """Peaks grouped by mode, order and signal. Signals are in the order of `SIGNALS`, and those with the largest
     ripple come first.
     """
-    keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found)
-    answer = []
+    keys = dict.fromkeys((p.mode, p.order, p.signal) for p in peaks)
+    resonances = []
     for key in keys:
-        alike = [p for p in found if (p.mode, p.order, p.signal) == key]
-        speeds, lines = [p.speed for p in alike], [p.frequency for p in alike]
-        avoid = min(p.low for p in alike), max(p.high for p in alike)
-        ends = (min(speeds), max(speeds)), avoid, (min(lines), max(lines))
-        answer.append(
+        members = [p for p in peaks if (p.mode, p.order, p.signal) == key]
+        speeds, frequencies = [p.speed for p in members], [p.frequency for p in members]
+        avoid = min(p.low for p in members), max(p.high for p in members)
+        ranges = (min(speeds), max(speeds)), avoid, (min(frequencies), max(frequencies))
+        resonances.append(
             Resonance(
-                *key, *ends, tuple(p.payload for p in alike), max(p.ripple for p in alike), max(p.rise for p in alike)
+                *key,
+                *ranges,
+                tuple(p.payload for p in members),
+                max(p.ripple for p in members),
+                max(p.rise for p in members),
             )
         )
-    return sorted(answer, key=lambda r: (list(SIGNALS).index(r.signal), -r.ripple))
+    return sorted(resonances, key=lambda r: (list(SIGNALS).index(r.signal), -r.ripple))
 
 
-def strongest_resonances(found: Sequence[Resonance]) -> list[Resonance]:
+def strongest_resonances(resonances: Sequence[Resonance]) -> list[Resonance]:
     """Resonances to avoid: for each signal, all whose ripple is at least 1 % and whose rise is at least half of the
     largest."""
-    largest = {s: max((r.rise for r in found if r.signal == s), default=0.0) for s in SIGNALS}
-    return [r for r in found if r.rise >= largest[r.signal] / 2 and r.ripple >= MATTERS]
+    largest = {signal: max((r.rise for r in resonances if r.signal == signal), default=0.0) for signal in SIGNALS}
+    return [r for r in resonances if r.rise >= largest[r.signal] / 2 and r.ripple >= MATTERS]

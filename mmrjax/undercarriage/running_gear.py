@@ -290,14 +290,18 @@ def tips_on_path(path: BeltPath, place: Numbers) -> PathTips:
     x (gap - x) / gap per unit of tension. Both ends of the lower run are equal: x counts from the nearer.
     """
     gear, radius = path.gear, path.radius
-    run, arc, base = gear.wheelbase, jnp.pi * radius, gear.grouser_length
-    ahead = (place < run / 2) | (place > run + arc + run / 2)
-    side = jnp.where(ahead, 1.0, -1.0)
-    x = jnp.where(ahead, jnp.where(place < run / 2, place, place - path.length), run - place)
+    run = gear.wheelbase
+    arc = jnp.pi * radius
+    base_length = gear.grouser_length
+    is_ahead = (place < run / 2) | (place > run + arc + run / 2)
+    side = jnp.where(is_ahead, 1.0, -1.0)
+    x = jnp.where(is_ahead, jnp.where(place < run / 2, place, place - path.length), run - place)
     arc_angle = jnp.clip(-x / radius, 0.0, jnp.pi)  # on the arc, from its bottom
-    share = jnp.clip((base / 2 - x) / base, 0.0, 1.0)  # of the base on the arc
-    tilt = jnp.minimum(jnp.where(x < -base / 2, -x / radius, share**2 * base / (2 * radius)), jnp.pi)
-    tilt_rate = -jnp.where(tilt < jnp.pi, share, 0.0) / radius
+    base_share = jnp.clip((base_length / 2 - x) / base_length, 0.0, 1.0)  # of the base on the arc
+    tilt = jnp.minimum(
+        jnp.where(x < -base_length / 2, -x / radius, base_share**2 * base_length / (2 * radius)), jnp.pi
+    )
+    tilt_rate = -jnp.where(tilt < jnp.pi, base_share, 0.0) / radius
     rise = gear.guide_recess * cubic_step(x, 0.0, 0.0, gear.guide_gap, 1.0)
     u = jnp.clip(x / gear.guide_gap, 0.0, 1.0)
     rise_rate = gear.guide_recess * 6 * u * (1 - u) / gear.guide_gap
@@ -374,17 +378,17 @@ def tension_along(
     run, arc = path.gear.wheelbase, jnp.pi * path.radius
     on_run = place < run
     x = jnp.where(on_run, place / run, 0.0)
-    load = jnp.where(on_run, force, 0.0)
+    force_on_run = jnp.where(on_run, force, 0.0)
 
-    def lower(at: Scalar) -> Scalar:
-        return tension.lower + jnp.sum(load * (x - (at < place)))
+    def lower_tension(station: Scalar) -> Scalar:
+        return tension.lower + jnp.sum(force_on_run * (x - (station < place)))
 
-    def one(at: Float[Array, ""]) -> Float[Array, ""]:
-        rear = jnp.clip((at - run) / arc, 0.0, 1.0)
-        front = jnp.clip((at - 2 * run - arc) / arc, 0.0, 1.0)
+    def tension_at(station: Float[Array, ""]) -> Float[Array, ""]:
+        rear = jnp.clip((station - run) / arc, 0.0, 1.0)
+        front = jnp.clip((station - 2 * run - arc) / arc, 0.0, 1.0)
         # from the end of the lower run over the rear arc to the upper run, and over the front arc back down
-        up = lower(run) * (1 - rear) + tension.upper * rear
-        down = tension.upper * (1 - front) + lower(-1.0) * front
-        return jnp.where(at < run, lower(at), jnp.where(at < run + arc + run, up, down))
+        up = lower_tension(run) * (1 - rear) + tension.upper * rear
+        down = tension.upper * (1 - front) + lower_tension(-1.0) * front
+        return jnp.where(station < run, lower_tension(station), jnp.where(station < run + arc + run, up, down))
 
-    return jax.vmap(one)(stations)
+    return jax.vmap(tension_at)(stations)

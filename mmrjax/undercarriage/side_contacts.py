@@ -99,24 +99,24 @@ def compute_contacts(
 
     Args:
         path: the belt's path.
-        chassis: chassis on tracks the grousers carry load, on wheels the wheels, of its radius.
+        chassis: chassis. On tracks the grousers carry load, on wheels the wheels of its radius.
         q, v: coordinates and velocities, see the module.
     """
     gear = path.gear
     belt = belt_runs(path, (q[3], q[4]), (v[3], v[4]))
     place, weight = path.place(q[3], q[4])
-    tip_places = tips_on_path(path, place)
+    tips = tips_on_path(path, place)
     pitch = q[2]
     cos, sin = cosine(pitch), sine(pitch)
-    forward, up = join_contacts(tip_places.forward, path.gear.wheelbase / 2 * _END), join_contacts(tip_places.up)
-    ahead, rise = join_contacts(tip_places.rate_forward), join_contacts(tip_places.rate_up)
+    tip_forward, tip_up = join_contacts(tips.forward, path.gear.wheelbase / 2 * _END), join_contacts(tips.up)
+    tip_rate_forward, tip_rate_up = join_contacts(tips.rate_forward), join_contacts(tips.rate_up)
     # The lowest point of a wheel is below its axle at any pitch of the robot.
     wheel_radius = jnp.where(WHEEL, chassis.radius, 0.0)
     x, z, rate_x, rate_z, weight = (
-        forward * cos + up * sin,
-        up * cos - forward * sin - wheel_radius,
-        ahead * cos + rise * sin - wheel_radius / path.radius,
-        rise * cos - ahead * sin,
+        tip_forward * cos + tip_up * sin,
+        tip_up * cos - tip_forward * sin - wheel_radius,
+        tip_rate_forward * cos + tip_rate_up * sin - wheel_radius / path.radius,
+        tip_rate_up * cos - tip_rate_forward * sin,
         join_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
     )
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
@@ -124,11 +124,11 @@ def compute_contacts(
     gap_rate = v[1] - v[2] * x + rate_z * speed
     # Tension of the lower run without its centrifugal part: a slack belt keeps 1 % of its pre-tension.
     tension = jnp.maximum(belt.lower - belt.centrifugal, 0.01 * gear.pretension)
-    compliance = join_contacts(tip_places.compliance / tension)
+    compliance = join_contacts(tips.compliance / tension)
     depth = jnp.maximum(-gap, 1e-9)
-    yields = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
-    bears = jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
-    stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
+    softening = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
+    carries_load = jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
+    stiffness, damping = gear.contact_stiffness * softening, gear.contact_damping * softening
     force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
     return ContactState(
         lever_x=x,
@@ -140,9 +140,9 @@ def compute_contacts(
         gap=gap,
         gap_rate=gap_rate,
         compliance=compliance,
-        force=(force * bears),
-        damped=damping_contact(force, gap, 0.0, damping, gear.contact_depth) * bears,
-        guided=join_contacts(tip_places.guided),
+        force=(force * carries_load),
+        damped=damping_contact(force, gap, 0.0, damping, gear.contact_depth) * carries_load,
+        guided=join_contacts(tips.guided),
         place=place,
         belt=belt,
     )
@@ -173,13 +173,18 @@ class ContactPull(eqx.Module):
         return jnp.sum(self.force)
 
 
-def sliding_speeds(signals: Signals, at: ContactState) -> PerContact:
+def sliding_speeds(signals: Signals, contacts: ContactState) -> PerContact:
     """Backward sliding speed of each contact over the ground [m/s]. `speed_slip_terms` is added to it."""
-    return -at.speed_x - signals.speed_slip_terms
+    return -contacts.speed_x - signals.speed_slip_terms
 
 
 def contact_forces(
-    path: BeltPath, chassis: Chassis, signals: Signals, at: ContactState, height: Scalar, force: Array | None = None
+    path: BeltPath,
+    chassis: Chassis,
+    signals: Signals,
+    contacts: ContactState,
+    height: Scalar,
+    force: Array | None = None,
 ) -> ContactPull:
     """Friction of the contacts (25) by Fig. 7, of the guide (26), and all generalized forces.
 
@@ -190,21 +195,25 @@ def contact_forces(
         path: the belt's path.
         chassis: friction and guide coefficients.
         signals: signals up to `balances.slip`. `speed_slip_terms` is added to the sliding of every contact.
-        at: state of the contacts.
+        contacts: state of the contacts.
         height: height of the axles above the ground [m].
         force: traction of each contact, if contacts slide laterally too [N]. None: by Fig. 7.
     """
     if force is None:
-        force = chassis.ground.traction(sliding_speeds(signals, at), at.force, signals.adhesion)
-    guide = chassis.track.guide_friction * at.guided * at.force * signals.direction
+        force = chassis.ground.traction(sliding_speeds(signals, contacts), contacts.force, signals.adhesion)
+    guide = chassis.track.guide_friction * contacts.guided * contacts.force * signals.direction
     # Power of the contact forces per belt speed, then on the pulleys in their shares of that speed.
-    along = force * at.rate_x + at.force * at.rate_z - guide
-    front = path.radius * jnp.sum(along * (1 - at.weight)) + at.belt.torque_front
-    rear = path.radius * jnp.sum(along * at.weight) + at.belt.torque_rear
-    forward = jnp.sum(force) - signals.resistance
-    moment = jnp.sum(force * at.lever_z - at.force * at.lever_x) + signals.resistance * height
+    belt_force = force * contacts.rate_x + contacts.force * contacts.rate_z - guide
+    torque_front = path.radius * jnp.sum(belt_force * (1 - contacts.weight)) + contacts.belt.torque_front
+    torque_rear = path.radius * jnp.sum(belt_force * contacts.weight) + contacts.belt.torque_rear
+    force_forward = jnp.sum(force) - signals.resistance
+    moment = jnp.sum(force * contacts.lever_z - contacts.force * contacts.lever_x) + signals.resistance * height
     return ContactPull(
-        force, guide, jnp.sum(at.guided * at.force), -front, jnp.stack([forward, at.normal, moment, rear])
+        force,
+        guide,
+        jnp.sum(contacts.guided * contacts.force),
+        -torque_front,
+        jnp.stack([force_forward, contacts.normal, moment, torque_rear]),
     )
 
 
@@ -234,19 +243,23 @@ class GearReactions(eqx.Module):
         return jnp.sum(self.guided, axis=-1)
 
 
-def inner_loads(path: BeltPath, at: ContactState, pulled: ContactPull) -> GearReactions:
+def inner_loads(path: BeltPath, contacts: ContactState, contact_forces: ContactPull) -> GearReactions:
     """Loads on guides, pulleys and belt at an instant."""
-    guided = at.guided * at.force
-    to_support = at.force - guided
-    ahead = at.lever_x > 0
-    against = (-pulled.force * at.rate_x + pulled.guide)[:GROUSERS]
+    guide_loads = contacts.guided * contacts.force
+    support_loads = contacts.force - guide_loads
+    is_ahead = contacts.lever_x > 0
+    force_on_belt = (-contact_forces.force * contacts.rate_x + contact_forces.guide)[:GROUSERS]
     return GearReactions(
-        grouser=at.force[:GROUSERS],
-        guided=guided[:GROUSERS],
-        support=jnp.stack([jnp.sum(jnp.where(ahead, to_support, 0.0)), jnp.sum(jnp.where(ahead, 0.0, to_support))]),
-        place=at.place,
-        tension=tension_along(path, at.belt, at.place, against, (jnp.arange(GROUSERS) + 0.5) * path.pitch),
-        centrifugal=at.belt.centrifugal,
+        grouser=contacts.force[:GROUSERS],
+        guided=guide_loads[:GROUSERS],
+        support=jnp.stack(
+            [jnp.sum(jnp.where(is_ahead, support_loads, 0.0)), jnp.sum(jnp.where(is_ahead, 0.0, support_loads))]
+        ),
+        place=contacts.place,
+        tension=tension_along(
+            path, contacts.belt, contacts.place, force_on_belt, (jnp.arange(GROUSERS) + 0.5) * path.pitch
+        ),
+        centrifugal=contacts.belt.centrifugal,
     )
 
 
@@ -259,14 +272,17 @@ def lever_tips(gear: RunningGear, conditions: Conditions) -> list[tuple[Scalar, 
 
 
 def contact_damping(
-    along: Float[Array, "contacts n"], off: Float[Array, "contacts n"], pulled: Array, force: Array, rises: Array,
-    damped: Array,
+    along: Float[Array, "contacts n"], off: Float[Array, "contacts n"], friction: Array, force: Array,
+    friction_slopes: Array, normal_damping: Array,
 ) -> Float[Array, "n n"]:  # fmt: skip
     """Damping matrix of the contacts, see `damping_matrix`.
 
-    `along` and `off`: their speeds along and normal to the ground per v. `pulled`: friction force [N]. `force`:
-    normal force [N]. `rises`: derivative of friction with sliding speed. `damped`: decrease of the normal force per
-    rate of the gap.
+    Args:
+        along, off: speeds of the contacts along the ground and off it, per v.
+        friction: friction forces [N].
+        force: normal forces [N].
+        friction_slopes: derivatives of friction with sliding speed [N·s/m].
+        normal_damping: decrease of the normal forces per rate of the gap [N·s/m].
     """
-    pushes = (pulled / jnp.maximum(force, 1e-9))[:, None] * along + off
-    return (along.T * rises) @ along + (pushes.T * damped) @ off
+    pushes = (friction / jnp.maximum(force, 1e-9))[:, None] * along + off
+    return (along.T * friction_slopes) @ along + (pushes.T * normal_damping) @ off
