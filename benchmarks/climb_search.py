@@ -64,7 +64,7 @@ def run(
 
 def begotten(random: np.random.Generator, begin: LeverSequence, stretch: float, n: int) -> np.ndarray:
     """Angles of a first generation: those of a sequence over time, slowed down, and perturbed in all but one."""
-    at = stretch * np.asarray(begin.at)
+    at = stretch * np.asarray(begin.knots)
     own = np.stack([np.interp(KNOTS, at, np.degrees(np.asarray(a))) for a in (begin.front, begin.rear)])
     spread = np.linspace(0, 30, n)[:, None, None]
     return bounded(own + spread * random.normal(size=(n, *own.shape)))

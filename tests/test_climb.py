@@ -124,8 +124,8 @@ def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, durati
         return state, jnp.zeros((1, samples))
 
     running = None, None, climb.VerdictState(jnp.array([climb._RUNNING]), *[jnp.zeros(1)] * 4)
-    monkeypatch.setattr(climb, "_begin", lambda *a: running)
-    monkeypatch.setattr(climb, "_compiled", part)
+    monkeypatch.setattr(climb, "_begin_batch", lambda *a: running)
+    monkeypatch.setattr(climb, "_advance_compiled", part)
     climb_batch(ROBOT, None, None, None, duration=duration, step=step)
     first, sample, samples = (np.array(x) for x in zip(*parts, strict=True))
     ends = first + sample * samples
@@ -165,13 +165,18 @@ def test_motors_of_levers_load_the_battery():
     motion = climb.stand_before_obstacle(run)
     after = jax.jit(lambda m: climb.advance_climb(run, m, 1.0, NO_ENERGY)[::2])
     volts = [8 * 4.17 - 8 * 0.049 * (1.5 + drawn) for drawn in (0.0, 10.0)]
-    (end, passed), (end_pulls, passed_pulls) = after(motion), after(replace(motion, drawn=jnp.asarray(10.0)))
+    (end, passed), (end_pulls, passed_pulls) = (
+        after(motion),
+        after(replace(motion, lever_supply_current=jnp.asarray(10.0))),
+    )
     assert [float(p.voltage) for p in (passed, passed_pulls)] == pytest.approx(volts)
     assert float(end_pulls.discharge - end.discharge) == pytest.approx(10 * float(run.step))
     # asked to swing they take their current by the duty of their bridge
     end, passed = after(replace(motion, q=motion.q.at[4].add(-0.5)))
     share = float(passed.lever_voltage[0]) / volts[0]
-    assert 0.01 < share < 1 and float(end.drawn) == pytest.approx(share * float(passed.lever_current[0]))
+    assert 0.01 < share < 1 and float(end.lever_supply_current) == pytest.approx(
+        share * float(passed.lever_current[0])
+    )
 
 
 @pytest.mark.slow

@@ -29,13 +29,13 @@ def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path, robot
     sequence = read_sequence(
         text_file(tmp_path / "s.csv", "x_mm,front_deg,rear_deg\n-300,45,180\n0,0,-8\n"), robot, (0.0, 0.0)
     )
-    assert np.degrees(sequence.asked(-0.15, 0.0)) == pytest.approx([22.5, 86])
+    assert np.degrees(sequence.demand(-0.15, 0.0)) == pytest.approx([22.5, 86])
     assert not sequence.over_time
     sequence = read_sequence(
         text_file(tmp_path / "v.csv", "time_s,front_V,rear_V\n0,0,0\n1,6,-12\n"), robot, (0.5, 0.1)
     )
     assert np.asarray(sequence.first) == pytest.approx([0.5, np.pi - 0.1]) and sequence.over_time
-    assert np.asarray(sequence.asked(0.0, 0.5)) == pytest.approx([3.0, -6.0])
+    assert np.asarray(sequence.demand(0.0, 0.5)) == pytest.approx([3.0, -6.0])
 
 
 FILES = {

@@ -76,9 +76,9 @@ def test_derivatives_are_the_limits_of_finite_differences_with_contacts_at_the_e
     for name in ("margin_success", "margin_reach", "margin_upright", "crest_energy_J", "crest_current_rms_A"):
         up, down = (np.array([float(end[name]) for end in half]) for half in (ends[:2], ends[2:]))
         finite = (up - down) / (2 * np.diag(moves))
-        rounded = 1e-11 * abs(found.found[name]) / np.diag(moves)  # what a run of 6000 steps is known to
-        assert (np.abs(found.by[name] - finite) < 1e-4 * np.abs(finite) + rounded).all(), name
+        rounded = 1e-11 * abs(found.outputs[name]) / np.diag(moves)  # what a run of 6000 steps is known to
+        assert (np.abs(found.derivatives[name] - finite) < 1e-4 * np.abs(finite) + rounded).all(), name
         assert np.isfinite(found.slope[name]).all() and (found.slope_sd[name] >= 0).all()
     # a heavier robot takes more energy, by whichever
-    by, slope, sd = (x["crest_energy_J"][0] for x in (found.by, found.slope, found.slope_sd))
+    by, slope, sd = (x["crest_energy_J"][0] for x in (found.derivatives, found.slope, found.slope_sd))
     assert by > 0 and abs(by - slope) < 5 * sd + 0.2 * slope

@@ -53,7 +53,7 @@ def simulated():
 
     def of(shares, robot, values):
         moved = dict(zip((NAMES[f] for f in MOVED), values * shares, strict=True))
-        signals = history_signals(params.replace(robot, moved), run, jnp.asarray(times), at=at)
+        signals = history_signals(params.replace(robot, moved), run, jnp.asarray(times), indices=at)
         return jnp.stack([signals.current, signals.speed_motor], -1), signals
 
     program = jax.jit(jax.jacfwd(of, has_aux=True))

@@ -151,7 +151,7 @@ def test_charge_that_is_off_shows_in_what_is_unaccounted_for(cut):
     """The energy of a battery follows from its charge: one that has drifted by 1.3e-4 is not overlooked."""
     through = float(cut.total.of["drawn"])
     assert abs(cut.total.unaccounted) < 1e-6 * through
-    drifted = dataclasses.replace(cut.total, given=cut.total.given * (1 + 1.3e-4))
+    drifted = dataclasses.replace(cut.total, supplied=cut.total.supplied * (1 + 1.3e-4))
     assert drifted.unaccounted == pytest.approx(1.3e-4 * through, rel=1e-2)
 
 

@@ -92,7 +92,7 @@ def test_a_program_of_an_exposed_folder_is_neither_read_nor_written(tmp_path, mo
     monkeypatch.setenv(programs.VARIABLE, str(tmp_path))
     Path(tmp_path).chmod(0o777)
     asked = []
-    monkeypatch.setattr(programs.Programs, "_obtained", lambda *a: lambda: asked.append(a))
+    monkeypatch.setattr(programs.Programs, "_loaded_or_lowered", lambda *a: lambda: asked.append(a))
     assert programs.Programs(exposure_reason).of(((1.0,), {})) is None and not asked
     Path(tmp_path).chmod(0o700)
     programs._folder_is_private.cache_clear()

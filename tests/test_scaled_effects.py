@@ -58,7 +58,7 @@ def test_signals_of_the_nominal_robot_in_the_file_are_those_of_its_equations():
         )
     )
     conditions = mm.Conditions(configurations.astype(int), volts, slopes, payloads)
-    computed = results_of_rows(robot, conditions, rests=False)[1]
+    computed = results_of_rows(robot, conditions, static_at_rest=False)[1]
     for field in dataclasses.fields(stored):
         expected = getattr(computed, field.name)
         if isinstance(expected, jnp.ndarray):

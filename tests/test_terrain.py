@@ -129,7 +129,7 @@ def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model(robot):
 def test_points_project_on_the_belt_where_they_came_from_and_tips_move_as_they_say():
     belt_ = lever()
     place = jnp.linspace(0, float(belt_.length), 500)[:-1]
-    height, back = belt_.project(belt_.point(place) + 0.004 * belt_.normal(belt_.turned(place)))
+    height, back = belt_.project(belt_.point(place) + 0.004 * belt_.normal(belt_.turning_angle(place)))
     assert height == pytest.approx(0.004, abs=1e-12)
     off = np.abs(back - place)
     assert np.minimum(off, float(belt_.length) - off) == pytest.approx(0, abs=1e-10)

@@ -15,7 +15,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, FAILED, FLAGS, TIPS
 from mmrjax.undercarriage import modes
 from mmrjax.undercarriage.half_robot import build_system, instant, stand, tipping_margin
-from mmrjax.undercarriage.modes import _whole, largest_step
+from mmrjax.undercarriage.modes import _step_that_divides, largest_step
 from sweeps import config as configuration
 from sweeps.points import run
 from sweeps.points.grid import grid_conditions
@@ -88,7 +88,7 @@ def test_lever_below_the_ground_of_the_tracks_is_refused(robot, lever, angle, sa
 @pytest.mark.parametrize("limit", [2.6e-4, 1.0999e-4, 1e-4, 3.7e-6, 0.5])
 def test_step_that_is_proposed_can_be_typed_in(limit):
     """It is not above the limit, divides the sample, and survives being printed, and it is not far below."""
-    proposed = _whole(1e-3, limit)
+    proposed = _step_that_divides(1e-3, limit)
     typed = float(f"{proposed:g}")
     assert 0.5 * min(limit, 1e-3) < typed <= limit * (1 + 1e-12)
     assert 1e-3 / typed == pytest.approx(round(1e-3 / typed), abs=1e-6)

@@ -39,7 +39,7 @@ def _power(run, motion):
     _, levers, rises = b.damping_matrix(run, motion, signals, sides, pulled)
     after, travel, _ = b.advance(run, motion)
     gained = after.v - motion.v
-    mean, at = motion.v + gained / 2, sides.at
+    mean, at = motion.v + gained / 2, sides.contacts
     ahead, aside, normal = b.contact_forces_after_step(at, pulled, levers, rises, gained)
     moves = [jnp.einsum("sci,si->sc", x, mean[b.OF_SIDE]) for x in levers]  # along, across, off
     front, rear = mean[b.PULLEYS].T
@@ -184,7 +184,7 @@ def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
     y = SIDES * chassis.turning.width
     speed = np.cos(q[b.YAW]) * v[0] + np.sin(q[b.YAW]) * v[1] - y * v[b.YAW]
     work = np.sum(
-        pulled.force * at.speed_x + pulled.aside * sides.aside + at.force * at.gap_rate - pulled.guide * belt
+        pulled.force * at.speed_x + pulled.aside * sides.lateral_speed + at.force * at.gap_rate - pulled.guide * belt
     )
     work += np.sum(
         at.belt.torque_front * front + at.belt.torque_rear * rear + (signals.torque_net + pulled.load) * front
@@ -192,7 +192,7 @@ def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
     work -= np.sum(signals.resistance * (speed - sides.height * v[b.PITCH]))
     assert forces @ v == pytest.approx(float(work), rel=1e-9)
     bears = at.force > 0
-    ratios = [(pulled.aside / sides.aside)[bears], (pulled.force / at.speed_x)[bears]]
+    ratios = [(pulled.aside / sides.lateral_speed)[bears], (pulled.force / at.speed_x)[bears]]
     assert_allclose(ratios[0] / ratios[1], 0.6 * chassis.turning.lateral, rtol=1e-9)
     assert bears.any(axis=1).all() and max(r.max() for r in ratios) < 0
 
@@ -214,7 +214,7 @@ def test_bodies_are_the_robot_that_mujoco_compiles(robot, configuration):
     ahead = float(half.centre[0])
     assert mass[0, 0] == pytest.approx(float(total))
     assert mass[3, 3] - mass[0, 0] * ahead**2 == pytest.approx(float(turning.inertia))
-    pitching = 2 * float(half.pitching(robot.running_gear.wheelbase) + 2 * half.inertia_pulley)
+    pitching = 2 * float(half.inertia_about_middle(robot.running_gear.wheelbase) + 2 * half.inertia_pulley)
     assert mass[4, 4] == pytest.approx(pitching)
     assert 0.02 < mass[5, 5] < mass[3, 3]
     ours, _ = mjcf.model_template(True)

@@ -202,7 +202,7 @@ def test_friction_is_on_its_ellipse_and_takes_power(rule):
         ahead, aside = float(jnp.sum(held.ahead)), float(jnp.sum(held.aside))
         assert (ahead / 3.0) ** 2 + (aside / 4.2) ** 2 == pytest.approx(1.0 if rule == 2 else u**2 + v**2, rel=1e-9)
         assert ahead * u + aside * v > 0
-        assert jnp.sum(held.across) == pytest.approx(aside * v, abs=1e-12)
+        assert jnp.sum(held.lateral_power) == pytest.approx(aside * v, abs=1e-12)
 
 
 def test_load_moves_to_the_outer_side_and_to_the_rear_as_forces_say():
@@ -210,9 +210,9 @@ def test_load_moves_to_the_outer_side_and_to_the_rear_as_forces_say():
     friction, rolling = Friction(static=0.6, dynamic=0.5), jnp.array([0.05, 0.05])
     held = jax.jit(lambda: grip(stance, friction, 1.0, 100.0, jnp.array([0.03, 0.05]), -0.05, 0.4, rolling))()
     along = float(jnp.sum(held.ahead - rolling * held.normal))
-    assert held.moved == pytest.approx(0.12 * float(jnp.sum(held.aside)) / 0.243, rel=1e-9)
+    assert held.load_transfer == pytest.approx(0.12 * float(jnp.sum(held.aside)) / 0.243, rel=1e-9)
     assert held.centre == pytest.approx(0.01 - 0.12 * along / 100.0, rel=1e-9)
-    assert (held.normal[1] - held.normal[0]) == pytest.approx(2 * float(held.moved), rel=1e-9)
+    assert (held.normal[1] - held.normal[0]) == pytest.approx(2 * float(held.load_transfer), rel=1e-9)
 
 
 @pytest.mark.slow
@@ -236,11 +236,11 @@ def test_forces_and_their_derivatives_are_those_of_loads_in_balance(height, lift
     assert_allclose(jnp.sum(1.2**1.4 * force * across, 1), found.aside, rtol=1e-9)
     assert_allclose(jnp.sum(1.2**1.4 * force * across * (place - 0.01), 1), found.moment, rtol=1e-9)
     assert bool((jnp.abs(found.centre) > 0.05) & (on_tracks > 0.5)) == (lifts and on_tracks > 0.5)
-    assert found.moved == pytest.approx(height * float(jnp.sum(found.aside)) / 0.5, rel=1e-9)
+    assert found.load_transfer == pytest.approx(height * float(jnp.sum(found.aside)) / 0.5, rel=1e-9)
     exact, step = jax.jacfwd(held)(x), 1e-6
     for k in range(len(x)):
         ahead, behind = held(x.at[k].add(step)), held(x.at[k].add(-step))
-        for name in ("normal", "ahead", "aside", "moment", "across", "moved", "centre"):
+        for name in ("normal", "ahead", "aside", "moment", "lateral_power", "load_transfer", "centre"):
             difference = (getattr(ahead, name) - getattr(behind, name)) / (2 * step)
             scale = 1e-6 * (1 + float(jnp.abs(difference).max()))
             assert_allclose(getattr(exact, name)[..., k], difference, rtol=1e-6, atol=scale, err_msg=name)

@@ -234,7 +234,7 @@ def parse_columns(
     for own_column, patterns in table.items():
         place = f"{where}, columns.{own_column}"
         if own_column not in spellings:
-            names_text = allowed_words(own_column, spellings, shown=layout.known())
+            names_text = allowed_words(own_column, spellings, listed=layout.known())
             raise BadConfiguration(f"{place}: no such column of a table; {names_text}; other units are allowed too")
         columns.append(_parse_column(own_column, patterns, place, keys, numbers))
     return tuple(columns)

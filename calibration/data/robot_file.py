@@ -419,7 +419,7 @@ def _parameter_choices(name: str, known: Collection[str]) -> str:
     if head in parts:
         return allowed_words(name, [n for n in known if n.startswith(f"{head}.")])
     keys = ("base", "sides", "configurations", *rig_file.KEYS)
-    return allowed_words(name, (*known, *keys), shown=(*parts, *keys))
+    return allowed_words(name, (*known, *keys), listed=(*parts, *keys))
 
 
 def _check_pairs(robot: Robot, where: str) -> None:

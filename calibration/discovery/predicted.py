@@ -131,7 +131,7 @@ def predict_readings(
     the residuals of the equations there, shape (runs, unknowns), and all predictions.
     """
     acts = tuple(act(robot, arguments) for act, arguments in zip(experiments.acts, experiments.at, strict=True))
-    result, _, residual = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
+    result, _, residual = map_over_runs(IMPLICIT.results_at, robot, experiments, unknowns, found)
     all_readings = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
     is_held = np.array([experiments.set_up[k][0] is menu.locked for k in experiments.which])
     does = jnp.where(jnp.asarray(is_held), result.status == STALLED, is_done(result.status))

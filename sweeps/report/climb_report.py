@@ -151,8 +151,9 @@ class ClimbResult:
             return None
         return [
             {
-                "output": name, "unit": unit, "value": d.found[name], "by": by, "by_unit": by_unit, "by_value": value,
-                "by_width": width, "derivative": float(d.by[name][k]), "slope": float(d.slope[name][k]),
+                "output": name, "unit": unit, "value": d.outputs[name],
+                "by": by, "by_unit": by_unit, "by_value": value, "by_width": width,
+                "derivative": float(d.derivatives[name][k]), "slope": float(d.slope[name][k]),
                 "slope_sd": float(d.slope_sd[name][k]),
             }
             for name, (unit, _) in OUTPUTS.items()

@@ -168,7 +168,7 @@ def starts_table(starts: Sequence[Any]) -> Table:
         numbers: list[float | None] = [None] * 10
         if s.time.size:
             stages = s.stages
-            times, slips = [stages.starting, stages.slipping, stages.settled], [*stages.slip, stages.over_settling]
+            times, slips = [stages.starting, stages.slipping, stages.settled], [*stages.slip, stages.slip_settling]
             if not s.gets_under_way:
                 times, slips = [None] * 3, [math.nan] * 4
             numbers = [*times, *(stages.sense * x for x in (s.peak, *s.ended)), *(100 * x for x in slips)]

@@ -157,10 +157,10 @@ def _memory_along_run(
 
     def after(memory: Array, step: tuple[LinearisedRun, RunStep]) -> tuple[Array, Array]:
         run, run_step = step
-        held, spans = run_step.held(constant), jnp.diff(run.clock)
+        held, spans = run_step.all_conditions(constant), jnp.diff(run.clock)
 
         def stage(memory: Array, span: Array, k: int) -> Array:
-            rate, slope = value_and_slope(lambda m: rates(run.places[k], held, run.sides[k], m), memory)
+            rate, slope = value_and_slope(lambda m: rates(run.stage_unknowns[k], held, run.directions[k], m), memory)
             return memory + span * rate / (1 - span * slope)
 
         first = stage(memory, spans[0], 0)

@@ -229,7 +229,7 @@ class SettledRuns(Observer):
 
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
         assert self._implicit is not None
-        shown_run = functools.partial(self._implicit.shown, robot)
+        shown_run = functools.partial(self._implicit.results_at, robot)
         result, signals, residual = jax.vmap(shown_run)(self.conditions, unknowns, found)
         return self._simulated_readings(robot, result), signals, residual
 
