@@ -668,10 +668,6 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     replicates: Annotated[int, Field(ge=250, le=100_000)] = option_field(
         500, "Bootstrap tables. Time histories use at least 333"
     )
-    prefer: Literal["fit", "held-out"] = option_field(
-        "fit",
-        "Order of indistinguishable effects: misfit or held-out error",
-    )
     forbid: Names = option_field((), "Experiment to avoid, repeatable: stall, lifted, 'one motor', a configuration")
     model: Path | None = option_field(
         None,

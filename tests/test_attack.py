@@ -241,7 +241,7 @@ OPTIONS = {
     "simulate": "--voltage --slope --payload --mass --surface --configuration --set --robot --model --duration --step "
                 "--discharge --left --profile --runs --effects --config --posterior --levers-front",
     "sweep --dry-run": "--voltages --slopes --payloads --configurations --chunk --shard --outputs --export --config",
-    "loop measured": "--prior --noise --seed --replicates --forbid --prefer --within --rows",
+    "loop measured": "--prior --noise --seed --replicates --forbid --within --rows",
     "calibrate measured": "--free --fix --starts --population",
     "sensitivity": "--method --parameters --vary --evaluations",
     "climb": "--step --stairs --gap --terrain --sequence --find",

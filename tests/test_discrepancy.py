@@ -153,7 +153,7 @@ def test_curve_of_a_result_is_in_its_robot_and_takes_the_discrepancy_out(tmp_pat
     found = unnamed()
     what = found.unnamed
     assert found.chi2[0] - found.chi2[1] == pytest.approx(what.score) and what.score > 50
-    assert found.after.adequate and not found.before.adequate
+    assert found.adequate_after and found.before.rejected
     assert what.at.shape == what.value.shape == what.sd.shape and (what.sd > 0).all()
     assert np.abs(what.value / what.sd).max() > 5
     robot = written_and_read(found.robot, tmp_path)

@@ -4,8 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from calibration.discovery.loop_notes import Mechanism, MissingEffect, VerdictSummary
-from calibration.discovery.verdict import headline
+from calibration.discovery.loop_notes import Mechanism, MissingEffect, VerdictSummary, headline
 from calibration.words.loop_words import loop_answer
 
 DROP, SLIP = "voltage drop that changes with current", "slip that changes with demand"

@@ -253,9 +253,8 @@ def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(rob
             assert ahead and self.keep("ranking", lambda: 1) == self.keep("search 0", lambda: 1) == 1
             return LoopStages("none")
 
-    readings = discover.Stage("readings", (), lambda given: LoopStages("place"))
-    base_and_settled = [s for s in discover.STAGES if s.name in ("base", "settled")]
-    monkeypatch.setattr(discover, "STAGES", (*base_and_settled, readings))
+    monkeypatch.setattr(discover, "trace_windows", lambda _: None)
+    monkeypatch.setattr(discover, "trace_readings", lambda *_: LoopStages("place"))
     trace_verdict = discover.trace_verdict
     monkeypatch.setattr(discover, "trace_verdict", Table.trace)
     given = LoopInput(

@@ -18,14 +18,11 @@ from test_stated_values import traced as leads
 from worlds import settled, tables
 
 from calibration.data.writing import json_value
+from calibration.discovery.findings import RejectedCandidate, StatedValue
 from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.loop_notes import NameSupport, NameTest, RuledOut
 from calibration.discovery.outliers import OutlierCluster
-from calibration.discovery.result import (
-    RejectedCandidate,
-    StatedValue,
-    WorseChannel,
-)
+from calibration.discovery.result import WorseChannel
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD
 from calibration.words.loop_words import p_value

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.described import describe
-from calibration.discovery import discover, verdict
+from calibration.discovery import discover, stages, verdict
 from calibration.discovery.loop_input import LoopInput, prepare_loop
 from calibration.discovery.stages import findings, search_until_clean
 from calibration.inference.lost_motion import lost_motion_notes
@@ -150,13 +150,8 @@ def test_a_rigid_base_that_leaves_only_noise_refutes_the_lost_motion(rejected, m
         SimpleNamespace(space=None),
     )
     monkeypatch.setattr(verdict, "missed_channels", lambda *_: ())
-    search = discover.Stage(
-        "search", ("screened",), lambda given, base: (base, diagnosis, None), ("screened", "left", "searched")
-    )
-    steps = {s.name: s for s in discover.STAGES} | {"search": search}
-    monkeypatch.setattr(
-        discover, "STAGES", [steps[name] for name in ("base", "settled", "readings", "search", "no search")]
-    )
+    monkeypatch.setattr(discover, "trace_windows", lambda _: None)
+    monkeypatch.setattr(stages, "search_until_clean", lambda given, screened, sds: (screened, diagnosis, None))
     notes = tuple(lost_motion_notes(runs, robot))
     given = LoopInput(runs, None, robot, *[None] * 4, at_first=notes, keep=lambda name, make: (
         SimpleNamespace(base=base), SimpleNamespace(noise=None)))  # fmt: skip

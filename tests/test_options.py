@@ -78,7 +78,6 @@ def test_units_bounds_choices_and_defaults_are_read_off_the_field():
     assert text(config.Sweep, "discharge_mAh") == (
         "Charge taken from the battery before (mAh).  [0 to 100000]  [default: 0]"
     )
-    assert text(config.Loop, "prefer").endswith(": fit, held-out.  [default: fit]")
     assert text(config.Resonance, "payloads_kg").endswith("[default: 0,1.5,3,5,6.5,8]")
     assert "[above 0, at most 0.01]  [default: 0.0001]" in text(config.Simulate, "step_s")
     assert text(config.Simulate, "battery") == "Use the robot's battery."

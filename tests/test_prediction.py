@@ -5,12 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx
 from scipy import stats
 
 from calibration.data.runs import Runs
 from calibration.discovery import prediction
+from calibration.discovery.assembly import errors_on_common_rows, worse_predictions
 from calibration.discovery.prediction import Gain, HeldOutScore, score_readings, smallest_predictive_set
+from calibration.discovery.result import WorseChannel
 from calibration.inference.blocks import distinct_held_out_blocks, predictable_blocks, unpredictable_kinds
+from mmrjax.model import channels
 
 RNG = np.random.default_rng(2)
 NONE_FREE = SimpleNamespace(names=(), tied=())
@@ -175,3 +179,40 @@ def test_a_block_with_parameters_of_its_own_is_not_predicted(names, tied, droppe
         kinds, lost = predictable_blocks(runs, problem), unpredictable_kinds(runs, problem)
     assert set(kinds.get("configuration", {})) == {"a", "b"} - set(dropped)
     assert len(kinds["voltage"]) == 2 and lost == (("configuration",) if dropped else ())
+
+
+# --- errors that rise -----------------------------------------------------------------------------------
+
+
+def held_out(before, after):
+    """Simulated readings of ten rows with these errors [%] in every channel, without and with effects."""
+    return tuple(np.full((10, len(channels.USUAL)), 100.0 + x) for x in (before, after))
+
+
+def worse(before, after):
+    """Channels of readings whose errors rise."""
+    shown, hundred = channels.channels_named(channels.USUAL), np.full((10, len(channels.USUAL)), 100.0)
+    readings = SimpleNamespace(measured=hundred, sd=hundred)
+    pair = errors_on_common_rows(shown, readings, np.ones(10, bool), before, after)
+    return worse_predictions({"voltage": pair})
+
+
+def test_an_error_that_rises_is_listed_and_said():
+    before, after = held_out(4.3, 4.3)
+    after[:, 1] = 104.72
+    assert worse(before, after) == (WorseChannel("voltage", "motor_speed", 10, approx(4.3), approx(4.72)),)
+
+
+def test_an_error_that_falls_or_stays_is_not_said():
+    before, after = held_out(4.3, 4.3)
+    after[:, 1], after[:, 2] = 104.0, 100 + 4.3 * 1.005
+    assert worse(before, after) == ()
+
+
+def test_errors_are_of_the_rows_that_both_predict():
+    """A fit that predicts two hard rows more is not worse for them. One that predicts fewer is said to."""
+    before, after = held_out(4.0, 4.0)
+    before[:2], after[:2] = np.nan, 140.0
+    assert worse(before, after) == ()
+    after[2:, 0] = 105.0
+    assert [(w.rows, w.before, w.after) for w in worse(before, after)] == [(8, approx(4.0), approx(5.0))]

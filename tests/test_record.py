@@ -95,7 +95,7 @@ def test_loop_is_as_recorded(name):
         assert abs(effect.parameters["amplitude"].value - value) < 0.05 * sd, effect.name
     # The bootstrap is of the same draws, so its thresholds move by rounding alone.
     for kind, threshold in was["thresholds"].items():
-        assert found.before.kinds[kind].threshold == pytest.approx(threshold, rel=0.02), kind
+        assert found.before.threshold(kind) == pytest.approx(threshold, rel=0.02), kind
     proposed = None if found.next_experiment is None else found.next_experiment.name
     assert proposed == was["next_experiment"]
     for channel, rms in was["rms_held_out"].items():

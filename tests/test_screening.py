@@ -13,8 +13,8 @@ from worlds import histories, rigs
 from calibration.discovery import candidates, log_simulation, log_stages, search, verdict
 from calibration.discovery.active_set import candidate_space
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.findings import EffectRanking, EffectScore
 from calibration.discovery.loop_notes import MissedChannel
-from calibration.discovery.result import EffectRanking, EffectScore
 from calibration.discovery.settings import settings_for
 from calibration.inference.blocks import predict_unseen
 from calibration.inference.observers import Histories

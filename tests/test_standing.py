@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from synthetic import SETTLED, table
 from worlds import laws, settled, tables
 
-from calibration.discovery import findings, preference, standing
+from calibration.discovery import findings, stages, standing
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.location import DiscrepancyLocation
@@ -519,33 +519,26 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         tests = [NameTest(e, 9.0 if e in established else 1.0, 3.0, (), evidence.get(e, 0.0)) for e in those.effects]
         return NameSupport(bool(established), "beside", tests=tuple(tests))
 
-    monkeypatch.setattr(preference, "judge_names", judged)
-    monkeypatch.setattr(preference.prediction, "smallest_predictive_set", lambda *a: few)
-    monkeypatch.setattr(preference.search, "diagnose_candidate", lambda *a: seen)
-    monkeypatch.setattr(preference.candidates, "start_of_fit", lambda *a: None)
+    monkeypatch.setattr(stages, "judge_names", judged)
+    monkeypatch.setattr(stages.prediction, "smallest_predictive_set", lambda *a: few)
+    monkeypatch.setattr(stages.search, "diagnose_candidate", lambda *a: seen)
+    monkeypatch.setattr(stages.candidates, "start_of_fit", lambda *a: None)
     monkeypatch.setattr(
-        preference.candidates,
+        stages.candidates,
         "fit_candidates",
         lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
     )
-    monkeypatch.setattr(preference.blocks_room, "predictable_blocks", lambda *a: {"slope": {"0": np.ones(3, bool)}})
+    monkeypatch.setattr(stages.blocks_room, "predictable_blocks", lambda *a: {"slope": {"0": np.ones(3, bool)}})
     bare = SimpleNamespace(observe=SimpleNamespace(long=False, reads=True, over_time=False, blocks=("slope",)))
     left = SimpleNamespace(test=SimpleNamespace(settings=SETTLED.settings), scores=None)
     beside = BaseCurve(SimpleNamespace(bare=bare), candidate_of(), left, ())
     searched = SearchResult((candidate_of("a"), candidate_of("b"), best), best, seen)
     given = SimpleNamespace(runs=None, settings=SETTLED.settings, progress=lambda note: None)
-    found, _, stood = preference.choose_effects(given, searched, beside, {})
+    found, _, stood = stages.choose_effects(given, searched, beside, {})
     assert (None if found is None else tuple(sorted(found[0].effects))) == model
     assert asked == [best.effects if adequate or few is None else few.effects]
     if found is not None:
         assert {e for e in found[0].effects if stood.established(e)} == set(established)
-
-
-def test_a_class_stands_whoever_leads_it():
-    support = NameSupport(True, "beside", tests=(NameTest("a", 9.0, 3.0, (), 0.0), NameTest("b", 1.0, 3.0, (), 0.0)))
-    other = support.with_leaders({"a": "c", "b": "b", "": ""})
-    assert other.established("c") and not other.established("a") and not other.established("b")
-    assert support.with_leaders({}) == support
 
 
 # --- settled runs ---------------------------------------------------------------------------------------

@@ -254,9 +254,8 @@ def windows():
     for each in (summary, dataclasses.replace(summary, mechanism=other)):
         yield loop_words.verdict_sentences(each)
     for adequate in (True, False):
-        after = SimpleNamespace(adequate=adequate)
         yield loop_words.naming_reasons(SimpleNamespace(
-            verdict="mechanism", summary=summary, effects=(), unnamed=here, support=SUPPORTS[7], after=after
+            verdict="mechanism", summary=summary, effects=(), unnamed=here, support=SUPPORTS[7], adequate_after=adequate,
         ))  # fmt: skip
 
 

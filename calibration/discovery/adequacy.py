@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from calibration.data import Json
 from calibration.discovery.score_tests import ScoreTable, StrongestStatistics
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
@@ -66,6 +67,14 @@ class AdequacyTest:
         promised = float(self.found.single) ** 2
         pair = self.found.pair - max(promised - gain, 0.0)
         return self.of(dataclasses.replace(self.found, single=np.sqrt(min(promised, gain)), pair=pair))
+
+    def to_json(self) -> Json:
+        """Entry of result.json: the strongest statistic of each kind, its critical value and its p-value."""
+        kinds = {
+            kind: {"found": float(getattr(self.found, kind)), "threshold": self.threshold(kind), "p": self.p(kind)}
+            for kind in self.settings.shares
+        }
+        return {**kinds, "p_value": self.p_value}
 
     @property
     def p_value(self) -> float:

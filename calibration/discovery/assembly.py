@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,14 +19,12 @@ from calibration.discovery import (
     hidden,
     loop_input,
     prediction,
-    preference,
     result,
     result_remarks,
     verdict,
 )
 from calibration.discovery.scales import goes_both_ways
 from calibration.discovery.settings import WITHOUT_NAME, Settings
-from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import fit_notes
 from calibration.inference.residual_clusters import find_residual_clusters
@@ -36,47 +34,72 @@ from mmrjax.model import channels, params
 
 def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> result.DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
-    runs, left, run, observe = given.runs, traced.left, traced.run, traced.screened.base.space.bare.observe
-    space, base, best = traced.screened.base.space, traced.screened.base.candidate, traced.best
-    noise, base_diagnosis, ends, predicted = traced.sds.noise, left, traced.ends, traced.predicted
-    if run is not None:  # of a log: its simulation
-        noise = noise if observe.reads else given.noise
-        best = run.base if best is base else run.best
-        space, base, predicted = run.space, run.base, {}
-        base_diagnosis, ends = run.diagnosis(base, left), run.diagnosis(best, ends)
+    runs, settings, numbers, run = given.runs, given.settings, given.numbers, traced.run
+    screened, left, alike, where = traced.screened, traced.left, traced.alike, traced.where
+    table, nameless = screened.base.space, traced.verdict in WITHOUT_NAME
+    # The fits without and with the proposal. For a log, those of its simulation.
+    space, base, best, predicted = table, screened.base.candidate, traced.best, traced.predicted
+    noise, before, after, is_added = traced.sds.noise, left, traced.ends, best is not base
+    if run is not None:
+        noise = noise if table.bare.observe.reads else given.noise
+        space, base, best, predicted = run.space, run.base, run.best if is_added else run.base, {}
+        before, after = run.diagnosis(base, left), run.diagnosis(best, after)
     observe, included = space.bare.observe, space.included[: len(runs)]
-    # The fit of the result: with the named effects, or with the curve if no name is given.
-    curve, z, sd, cost = None, best.z, best.sd, best.cost
-    beside = traced.beside if traced.verdict in WITHOUT_NAME and run is None else None
+    kind, kinds = type(observe), blocks_room.predictable_blocks(runs, space.bare)
+    first, last = prediction.FittedProblem(*space.fit_of(base.active, base.z)), None
+    known_first, known_last = (predicted.get(prediction.candidate_key(c)) for c in (base, best))
+    curve, z, sd, cost, decided_cost = None, best.z, best.sd, best.cost, traced.best.cost
+    beside = traced.beside if nameless and run is None else None
     if beside is not None:
         given.progress(fit_notes.progress_remark("shape"))
-        if best is base:
-            curve, ends = beside.curve, beside.diagnosis
-            z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
+    if is_added:
+        last = prediction.FittedProblem(*space.fit_of(best.active, best.z))
+    elif beside is not None:  # no effect is added, but a curve
+        curve, after = beside.curve, beside.diagnosis
+        z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
+        last, known_last, decided_cost = prediction.FittedProblem(curve.problem, z, None), None, cost
     given.progress(fit_notes.progress_remark("errors"))
-    kinds = blocks_room.predictable_blocks(runs, space.bare)
-    before, after = (prediction.FittedProblem(*space.fit_of(c.active, c.z)) for c in (base, best))
-    predictions = [predicted.get(prediction.candidate_key(c)) for c in (base, best)]
-    if curve is not None:
-        after, predictions[1] = prediction.FittedProblem(curve.problem, curve.z, None), None
-    added = curve is not None or best is not base
-    row_readings = prediction.readings_of_rows(runs, noise.sd, kinds, before, after if added else None, *predictions)
-    gains = _hold_out_gains(space, runs, predicted, traced.best.effects, row_readings)
-    gain = gains[-1][1] if gains and added else None
+    readings = prediction.readings_of_rows(runs, noise.sd, kinds, first, last, known_first, known_last)
+    gains = _hold_out_gains(space, runs, predicted, traced.best.effects, readings)
+    gain = gains[-1][1] if gains and last is not None else None
     # What is written never predicts worse than the refit. A curve, which claims no cause, has to predict better.
-    written = gain is None or (gain.mean > gain.se if best is base else gain.mean >= -prediction.WORSE)
+    written = gain is None or (gain.mean >= -prediction.WORSE if is_added else gain.mean > gain.se)
     if written and curve is not None:
         robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
     else:
-        fit, diagnosis = (best, ends) if written else (base, base_diagnosis)
+        fit, diagnosis = (best, after) if written else (base, before)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = active_set.posterior_of_fit(space, fit.active, fit.z, diagnosis.linear)
     given.progress(fit_notes.progress_remark("next"))
-    remaining = candidates.residuals_by_channel(space, runs, ends.linear, row_readings.after, z)
+    # What the loop claims: effects or an unnamed discrepancy, and what may be present in addition or instead.
+    decided = dataclasses.replace(best, cost=traced.best.cost)
+    effects = (
+        ()
+        if alike is None
+        else findings.found_effects(table, screened.base.candidate, decided, alike, left.test, settings)
+    )
+    concealed: tuple[hidden.HiddenEffect, ...] = ()
+    if alike is not None and not nameless and run is None:
+        ask = kind.menu and not observe.long
+        concealed = hidden.find_hidden_effects(table, best, alike, left, traced.ends, settings, ask=ask)
+    unnamed = None
+    if beside is not None and where is not None:
+        unnamed = findings.unnamed_discrepancy(beside, where, left.test.p_value, len(runs))
+    elif nameless and traced.beside is not None and where is not None:
+        unnamed = findings.unnamed_discrepancy_of_log(traced.beside, where, left.test.p_value)
+    ladder = () if traced.searched is None else (alike or traced.searched).ladder
+    near, too_large = findings.listed_alternatives(table, traced.best, decided_cost, ladder, settings)
+    scores, both_ways = findings.effect_scores(table, left.scores, settings), goes_both_ways(runs)
+    summary, library = verdict.verdict_summary(traced, numbers), sorted(given.library.items())
+    remaining = candidates.residuals_by_channel(space, runs, after.linear, readings.after, z)
     with np.errstate(invalid="ignore"):
-        share = 100 * noise.sd / np.maximum(type(observe).sizes(runs), 1e-12)
+        share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
+
+    errors = functools.partial(errors_on_common_rows, space.bare.channels, readings, included)
+    held_out = {word: errors(*x) for word, x in readings.held_out.items()}
     assembled = result.DiscoveryResult(
         verdict=traced.verdict,
+        summary=summary,
         robot=robot,
         refit=findings.proposed_robot(space, base),
         gains=gains,
@@ -84,112 +107,71 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         converged=converged,
         posterior=posterior,
         runs=runs,
-        numbers=given.numbers,
+        numbers=numbers,
         included=included,
-        unusable=tuple(int(given.numbers[k]) for k in traced.screened.base.unusable),
-        residual_clusters=find_residual_clusters(remaining, given.settings.seed),
-        before=findings.evidence_of_test(left.test, adequate=not left.test.rejected),
-        after=findings.evidence_of_test(ends.test, adequate=not ends.test.rejected_with_margin),
+        outliers=tuple(int(numbers[k]) for k in screened.outliers if table.bare.observe.reads),
+        unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
+        effects=effects,
+        unnamed=unnamed,
+        remains=None if nameless or alike is None else where,
+        next_experiment=_next_experiment(table, traced, settings),
+        cannot_see=findings.invisible_effects(table, left.scores, scores, settings),
+        needs_histories=tuple(name for name, e in library if e.transient and not kind.shows(e)),
+        needs_reverse=tuple(name for name, e in library if e.needs_reverse and not both_ways),
+        alternatives=near,
+        implausible=too_large,
+        hidden=concealed,
+        support=summary.support,
+        cluster=screened.cluster,
+        residual_clusters=find_residual_clusters(remaining, settings.seed),
+        before=left.test,
+        after=after.test,
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
-        detail=observe.detail(traced.screened.bases, included, base_diagnosis, ends),
-        readings_of_rows=row_readings,
+        scores=scores,
+        detail=observe.detail(screened.bases, included, before, after),
+        readings_of_rows=readings,
+        errors_as_stated=errors(readings.as_stated)[0],
+        errors=errors(readings.before, readings.after),
+        errors_held_out=held_out,
+        held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
+        held_out_worse=worse_predictions(held_out),
         noise={
             name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
             for k, name in enumerate(channels.channel_names(noise.channels))
             if noise.source[k] != "no readings"
         },
-        settings=given.settings,
+        settings=settings,
         replicates=len(left.test.null.single),
-        **_errors(space, runs, row_readings),
-        **_claims(given, traced, space, best, curve),
     )
-    # A temporary change is not uniform.
-    is_event = traced.where is not None and bases_room.window_from_name(traced.where.variable) is not None
-    remarks: list[fit_notes.Remark] = []
-    if run is not None and run.contradicts:
-        remarks.append(fit_notes.Remark("contradicted", promised=run.promised, gained=run.gained))
-    if not is_event or traced.sds.factors:
-        remarks += result_remarks.noise_remarks_before_verdict(traced.sds, remaining)
-    remarks += result_remarks.worse_than_stated(row_readings, noise, included)
-    return dataclasses.replace(assembled, remarks=(*remarks, *result_remarks.loop_remarks(assembled)))
+    return dataclasses.replace(assembled, remarks=result_remarks.loop_remarks(assembled, traced, noise, remaining))
 
 
-def _errors(space: active_set.CandidateSpace, runs: Runs, seen: prediction.ReadingsOfRows) -> dict[str, Any]:
-    """Errors of the result by channel: of the robot as stated, fitted, and on held-out rows."""
-    included = space.included[: len(runs), None]
-
-    def error(simulated: np.ndarray) -> result.Errors:
-        return channel_errors(space.bare.channels, np.where(included, simulated, np.nan), seen.measured, seen.sd)
-
-    held_out = {kind: preference.errors_on_common_rows(*x, error) for kind, x in seen.held_out.items()}
-    return {
-        "errors_as_stated": error(seen.as_stated),
-        "errors": preference.errors_on_common_rows(seen.before, seen.after, error),
-        "errors_held_out": held_out,
-        "held_out_unpredictable": blocks_room.unpredictable_kinds(runs, space.bare),
-        "held_out_worse": preference.worse_predictions(held_out),
-    }
+def errors_on_common_rows(
+    shown: Sequence[channels.Channel], readings: prediction.ReadingsOfRows, included: np.ndarray, *fits: np.ndarray
+) -> tuple[result.Errors, ...]:
+    """Errors of fits by channel, over the included readings that all of them predict."""
+    common = included[:, None] & np.isfinite(fits).all(0)
+    return tuple(channel_errors(shown, np.where(common, x, np.nan), readings.measured, readings.sd) for x in fits)
 
 
-def _claims(
-    given: loop_input.LoopInput,
-    traced: verdict.LoopStages,
-    simulated: active_set.CandidateSpace,
-    best: candidates.Candidate,
-    curve: discrepancy.Discrepancy | None,
-) -> dict[str, Any]:
-    """What the result claims: the verdict with its evidence, effects, alternatives and the next experiment.
+#: Least relative difference of hold-out errors that counts; less is invisible in two digits.
+TOLD = 0.01
+
+
+def worse_predictions(errors: Mapping[str, tuple[result.Errors, ...]]) -> tuple[result.WorseChannel, ...]:
+    """Channels whose hold-out error rises with the effects, for each kind of block.
 
     Args:
-        simulated: candidate space of the result, of a log the one of its simulation.
-        best: proposed fit there.
-        curve: fitted curve if no effect is proposed.
+        errors: kind of block → hold-out errors without and with the effects, over the rows that both fits predict.
     """
-    settings, screened, left, kind = given.settings, traced.screened, traced.left, type(simulated.bare.observe)
-    space, decided, alike, location = screened.base.space, traced.best, traced.alike, traced.where
-    nameless, compared, p_value = traced.verdict in WITHOUT_NAME, traced.held_out, left.test.p_value
-    effects: tuple[result.FoundEffect, ...] = ()
-    concealed: tuple[hidden.HiddenEffect, ...] = ()
-    if alike is not None:
-        candidate = dataclasses.replace(best, cost=decided.cost)
-        effects = findings.found_effects(space, screened.base.candidate, candidate, alike, left.test, settings)
-        if not nameless and not simulated.bare.observe.long and not compared:
-            compared = preference.compare_alternatives(simulated, given.runs, best, alike)
-        if not nameless and traced.run is None:
-            ask = kind.menu and not simulated.bare.observe.long
-            concealed = hidden.find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
-    unnamed = None
-    if nameless and traced.beside is not None and location is not None:
-        if traced.run is None:
-            unnamed = findings.unnamed_discrepancy(traced.beside, location, p_value, len(given.runs))
-        else:
-            unnamed = findings.unnamed_discrepancy_of_log(traced.beside, location, p_value)
-    cost = decided.cost if curve is None else curve.chi2[1] / 2
-    ladder = () if traced.searched is None else (alike or traced.searched).ladder
-    near, too_large = findings.listed_alternatives(space, decided, cost, ladder, settings)
-    scores, both_ways = findings.effect_scores(space, left.scores, settings), goes_both_ways(given.runs)
-    summary, library = verdict.verdict_summary(traced, given.numbers), sorted(given.library.items())
-    outliers = screened.outliers if space.bare.observe.reads else ()
-    return {
-        "summary": summary,
-        "support": summary.support,
-        "cluster": screened.cluster,
-        "outliers": tuple(int(given.numbers[k]) for k in outliers),
-        "effects": effects,
-        "unnamed": unnamed,
-        "remains": None if nameless or alike is None else location,
-        "next_experiment": _next_experiment(space, traced, settings),
-        "cannot_see": findings.invisible_effects(space, left.scores, scores, settings),
-        "needs_histories": tuple(name for name, e in library if e.transient and not kind.shows(e)),
-        "needs_reverse": tuple(name for name, e in library if e.needs_reverse and not both_ways),
-        "alternatives": near,
-        "implausible": too_large,
-        "alternatives_held_out": compared,
-        "hidden": concealed,
-        "scores": scores,
-    }
+    return tuple(
+        result.WorseChannel(kind, channel, int(new["rows"]), float(old["rms_percent"]), float(new["rms_percent"]))
+        for kind, (before, after) in errors.items()
+        for channel, new in after.items()
+        if new["rms_percent"] > (1 + TOLD) * (old := before[channel])["rms_percent"]
+    )
 
 
 def _hold_out_gains(

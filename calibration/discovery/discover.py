@@ -1,7 +1,4 @@
-"""The closed loop: its stages in order, see `STAGES`.
-
-A stage computes its results from the input and from earlier results. It may also report, and compile ahead.
-"""
+"""The closed loop: its stages in order, and its verdicts at other noise levels."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
 
 from calibration.data import Priors
 from calibration.data.columns import ROWS
@@ -18,12 +14,11 @@ from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.described import report_in_words
-from calibration.discovery import log_stages, loop_input, preference, stages, verdict
+from calibration.discovery import log_stages, loop_input, stages, verdict
 from calibration.discovery.assembly import assemble_result
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.outliers import Screening
 from calibration.discovery.result import DiscoveryResult, NoiseVerdict
-from calibration.discovery.settings import FIT
 from calibration.inference import fit_notes, population
 from calibration.inference import noise as noise_room
 from calibration.inference.optimizers import CORES
@@ -47,7 +42,6 @@ def discover(
     library: Library = effects.BY_NAME,
     replicates: int = 500,
     seed: int = 0,
-    prefer: str = FIT,
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
     progress: Callable[[str], None] = lambda text: None,
@@ -65,7 +59,6 @@ def discover(
         library: effects to test.
         replicates: number of bootstrap tables.
         seed: random seed.
-        prefer: criterion for the leading effect of a class, `fit` or `held-out`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that must not be proposed.
         rows: largest number of rows. Larger tables are thinned evenly: logs in time, tables over their conditions. A
             note reports it.
@@ -82,7 +75,7 @@ def discover(
     tell = report_in_words(progress)
     prepare = functools.partial(
         loop_input.prepare_loop, robot=robot, noise=noise, stated=stated, library=library, replicates=replicates,
-        seed=seed, prefer=prefer, forbidden=forbidden, rows=rows,
+        seed=seed, forbidden=forbidden, rows=rows,
     )  # fmt: skip
     ready = prepare(runs)
     given = dataclasses.replace(
@@ -162,44 +155,31 @@ def _remarks_on_noise(
 # --- the stages -----------------------------------------------------------------------------------------
 
 
-class Stage(NamedTuple):
-    """One stage of the loop.
-
-    Attributes:
-        name: name of the stage, and of its file if it is stored.
-        inputs: results of earlier stages that it needs, as fields of `LoopStages`.
-        function: function of the `LoopInput` and of these results. It returns its results, or all results of the
-            loop if these reach the verdict.
-        results: fields of `LoopStages` that it sets.
-        stored: True if its results are stored. "search" stores each of its rounds.
-    """
-
-    name: str
-    inputs: tuple[str, ...]
-    function: Callable[..., Any]
-    results: tuple[str, ...] = ()
-    stored: bool = False
-
-
 def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.LoopStages:
-    """Runs the stages of the loop up to the verdict, in the order of `STAGES`.
+    """Runs the stages of the loop up to the verdict. Each stage is a function of earlier stages.
+
+    A log may get its verdict from its windows, its settled runs or its linear readings. Otherwise the base is tested,
+    effects are searched for, and the claim follows from them.
 
     With `ahead`, other cores compile the programs of later stages during the fit of the base.
 
     If results with other sds are `known` for the same included rows, their bootstrap replicates are reused. In
     units of the sds, the statistics hardly depend on the sds. Logs keep their linear readings.
     """
-    traced = verdict.LoopStages()
     with contextlib.ExitStack() as others:
         given = dataclasses.replace(given, others=others if ahead else None, later=[], ranked=[])
-        for stage in STAGES:
-            make = functools.partial(stage.function, given, *(getattr(traced, name) for name in stage.inputs))
-            results = given.keep(stage.name, make) if stage.stored else make()
-            if isinstance(results, verdict.LoopStages):
-                return results
-            each = results if len(stage.results) > 1 else (results,)
-            traced = dataclasses.replace(traced, **dict(zip(stage.results, each, strict=False)))
-    return traced
+        if (traced := trace_known_readings(given)) is not None:
+            return traced
+        begin = trace_windows(given)
+        if isinstance(begin, verdict.LoopStages):
+            return begin
+        screened, sds = given.keep("base", lambda: stages.fit_base_and_noise(given, begin))
+        if (traced := trace_settled_runs(given, begin, screened)) is not None:
+            return traced
+        if (traced := trace_readings(given, begin, screened, sds)) is not None:
+            return traced
+        screened, left, searched = stages.search_until_clean(given, screened, sds)
+        return stages.reach_verdict(given, screened, left, sds, searched)
 
 
 def trace_known_readings(given: loop_input.LoopInput) -> verdict.LoopStages | None:
@@ -263,26 +243,3 @@ def trace_readings(
         return None
     readings = log_stages.readings_of_log(given, screened, sds, bool(given.ranked) or begin is not None)
     return log_stages.confirm_readings(given, readings, screened, sds, trace_verdict(readings))
-
-
-#: The loop. A stage that reaches the verdict is the last one.
-STAGES = (
-    Stage("other noise", (), trace_known_readings),
-    Stage("windows", (), trace_windows, ("begin",)),
-    Stage("base", ("begin",), stages.fit_base_and_noise, ("screened", "sds"), stored=True),
-    Stage("settled", ("begin", "screened"), trace_settled_runs),
-    Stage("readings", ("begin", "screened", "sds"), trace_readings),
-    Stage("search", ("screened", "sds"), stages.search_until_clean, ("screened", "left", "searched")),
-    Stage("no search", ("screened", "left", "sds", "searched"), stages.end_without_search),
-    Stage("confirm", ("screened", "left", "sds", "searched"), stages.confirm_search, ("searched",)),
-    Stage("curve", ("screened", "left"), stages.curve_of_base, ("beside",)),
-    Stage("effects", ("searched", "beside", "predicted"),
-          preference.choose_effects, ("chosen", "searched", "standing")),
-    Stage("described", ("sds", "searched", "chosen", "beside", "predicted", "screened"),
-          stages.check_described, ("missed",)),
-    Stage("mechanism", ("searched", "chosen", "standing", "beside", "predicted"),
-          stages.trace_mechanism, ("mechanism",)),
-    Stage("alternatives", ("searched", "chosen", "beside"), stages.find_alternatives, ("searched", "alike")),
-    Stage("claim", ("searched", "chosen", "alike", "standing", "beside", "mechanism"),
-          stages.reach_verdict, ("verdict", "searched", "alike", "standing", "where", "held_out")),
-)  # fmt: skip

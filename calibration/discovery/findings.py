@@ -10,14 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration import described
 from calibration.data import Names
-from calibration.discovery import adequacy, candidates, classes, projection, result, search
+from calibration.discovery import adequacy, candidates, classes, projection, search
 from calibration.discovery.active_set import CandidateSpace, with_only
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import BaseCurve
+from calibration.discovery.formula import Proposal
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
-from calibration.discovery.result import EffectRanking, RejectedCandidate
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, linearization
@@ -31,6 +32,83 @@ from mmrjax.model.robot import Robot
 # --- effects --------------------------------------------------------------------------------------------
 
 
+@dataclasses.dataclass(frozen=True)
+class ParameterEstimate:
+    """Fitted value of a parameter with its standard deviation, both in `unit`. `held_by_prior`: True if the data do
+    not determine it.
+    """
+
+    value: float
+    sd: float
+    unit: str
+    held_by_prior: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class ClassMember:
+    """An effect that explains the data as well as the leading effect of its class.
+
+    Attributes:
+        amplitude: fitted amplitude [unit].
+        size: amplitude relative to the largest plausible one [-].
+        rise_chi2: rise of χ² compared with the leading effect [σ²].
+    """
+
+    amplitude: float
+    size: float
+    rise_chi2: float
+
+
+@dataclasses.dataclass(frozen=True)
+class StatedValue:
+    """A stated value of the robot that may be wrong, in place of a missing effect.
+
+    Attributes:
+        value: value that explains the data.
+        stated: stated value, the mean of its prior. Both are in `unit`.
+        prior_sds: their distance in prior sds.
+        rise_chi2: rise of χ² compared with the effect [σ²].
+    """
+
+    value: float
+    stated: float
+    unit: str
+    prior_sds: float
+    rise_chi2: float
+
+
+@dataclasses.dataclass(frozen=True)
+class FoundEffect:
+    """An effect that the loop added to the model, with its alternatives and evidence.
+
+    Attributes:
+        name: name of the leading effect of its class.
+        members: the effect and all effects that the data cannot separate from it.
+        stated: base parameters, by name, whose stated value may be wrong instead.
+        families: families of the members, the leading one first. If there is only one, the equation and its driving
+            variable are known.
+        balance, unit: balance that the effect enters, and its unit.
+        equation, source: equation and source, from the effect's docstring.
+        parameters: fitted amplitude and shape.
+        p_value: share of bootstrap tables in which the strongest effect explains as much.
+        score: rise of χ² if the effect is removed and the rest refitted [σ²].
+        share: share of the excess misfit (χ² minus its expectation) that it explains [-].
+    """
+
+    name: str
+    members: dict[str, ClassMember]
+    stated: dict[str, StatedValue]
+    families: Names
+    balance: str
+    unit: str
+    equation: str
+    source: str
+    parameters: dict[str, ParameterEstimate]
+    p_value: float
+    score: float
+    share: float
+
+
 def found_effects(
     space: CandidateSpace,
     base: Candidate,
@@ -38,7 +116,7 @@ def found_effects(
     found: classes.Classes,
     test: adequacy.AdequacyTest,
     settings: Settings,
-) -> tuple[result.FoundEffect, ...]:
+) -> tuple[FoundEffect, ...]:
     """Result entry of each effect of the best candidate: its class, its parameters and its evidence.
 
     Args:
@@ -53,7 +131,7 @@ def found_effects(
         effect, gain = space.library[members[0]], float(2 * (without.cost - best.cost))
         equation, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
         effects.append(
-            result.FoundEffect(
+            FoundEffect(
                 name=effect.name,
                 members={name: _class_member(space, best, found, members[0], name) for name in members},
                 stated={s.name: _stated_value(space, best, s) for s in shifts},
@@ -73,18 +151,18 @@ def found_effects(
 
 def _effect_parameters(
     space: CandidateSpace, best: Candidate, slot: int, settings: Settings
-) -> dict[str, result.ParameterEstimate]:
+) -> dict[str, ParameterEstimate]:
     effect, k = space.library[best.active[slot]], space.free + slot
     amplitude, unit = linearization.amplitude_of(effect), amplitude_unit(effect)
     fitted = float(best.amplitude[slot] * unit), float(settings.width * best.sd[k] * unit)
     held_names = held_by_prior(best.sd)
-    values = {amplitude.name: result.ParameterEstimate(*fitted, amplitude.spec.unit, bool(held_names[k]))}
+    values = {amplitude.name: ParameterEstimate(*fitted, amplitude.spec.unit, bool(held_names[k]))}
     shape = linearization.free_shape_parameter(effect)
     if shape is not None:
         k += settings.slots
         value, slope = _shaped(linearization.shape_scales(shape), best.z[k])
         fitted = float(value), float(slope) * float(best.sd[k])
-        values[shape.name] = result.ParameterEstimate(*fitted, shape.spec.unit, bool(held_names[k]))
+        values[shape.name] = ParameterEstimate(*fitted, shape.spec.unit, bool(held_names[k]))
     return values
 
 
@@ -93,25 +171,54 @@ _shaped = jax.jit(jax.value_and_grad(linearization.shape_parameter_at, argnums=1
 
 def _class_member(
     space: CandidateSpace, best: Candidate, found: classes.Classes, leader: str, name: str
-) -> result.ClassMember:
+) -> ClassMember:
     """Result entry of an alternative effect of a class."""
     key = frozenset(best.with_effect(leader, name)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == key)
     position = other.active.index(name)
     amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
-    return result.ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
+    return ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
 
 
-def _stated_value(space: CandidateSpace, best: Candidate, shift: classes.Shift) -> result.StatedValue:
+def _stated_value(space: CandidateSpace, best: Candidate, shift: classes.Shift) -> StatedValue:
     coordinates, p, k = space.coordinates.base, space.free, shift.index
     value = [float(coordinates.value(np.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
     rise = float(2 * (shift.fit.cost - best.cost))
-    return result.StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
+    return StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
+
+
+@dataclasses.dataclass(frozen=True)
+class UnnamedDiscrepancy(DiscrepancyLocation):
+    """A discrepancy that no effect of the library explains.
+
+    Attributes:
+        unit: unit of the balance.
+        effect: name of the smooth curve in the proposed robot.
+        p_value: family-wise p-value.
+        score: decrease of χ² by the curve [σ²].
+        at: values of the variable [SI].
+        value, sd: value and standard deviation of the curve there [unit].
+        proposal: proposed formula.
+        over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
+            plus the row's residual, along the travel. None if single rows do not show it.
+    """
+
+    unit: str
+    effect: str
+    p_value: float
+    score: float
+    at: np.ndarray
+    value: np.ndarray
+    sd: np.ndarray
+    proposal: Proposal
+    over: np.ndarray | None = None
+    defect: np.ndarray | None = None
+    defect_sd: np.ndarray | None = None
 
 
 def unnamed_discrepancy(
     beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int
-) -> result.UnnamedDiscrepancy:
+) -> UnnamedDiscrepancy:
     """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit."""
     curve, linear, lacks = beside.curve, beside.diagnosis.linear, {}
     happens = bases.window_from_name(where.variable)
@@ -120,7 +227,7 @@ def unnamed_discrepancy(
         remains, sd = projection.balance_error_by_row(linear, curve.balance)
         defect = np.interp(x, curve.grid, curve.curve) + way * remains
         lacks = {"over": x[:rows], "defect": defect[:rows], "defect_sd": sd[:rows]}
-    return result.UnnamedDiscrepancy(
+    return UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=curve.unit,
         effect=curve.effect,
@@ -136,16 +243,41 @@ def unnamed_discrepancy(
 
 def unnamed_discrepancy_of_log(
     beside: BaseCurve, where: DiscrepancyLocation, p_value: float
-) -> result.UnnamedDiscrepancy | None:
+) -> UnnamedDiscrepancy | None:
     """The same for a log, to first order at its base fit. None for a wave, which has its own phase in each run."""
     if where.variable in bases.ORDERS:
         return None
-    curve, unit, formula = beside.linear_curve
+    curve, unit, proposal = beside.linear_curve
     points, value, sd = curve.drawn(curve.start, curve.covariance)
-    return result.UnnamedDiscrepancy(
+    return UnnamedDiscrepancy(
         **dataclasses.asdict(where), unit=unit, effect=curve.effect, p_value=p_value, score=curve.explained,
-        at=points, value=value, sd=sd, proposal=formula,
+        at=points, value=value, sd=sd, proposal=proposal,
     )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class RejectedCandidate:
+    """Effects that were fitted but are not proposed.
+
+    Attributes:
+        effects: amplitude of each effect.
+        prior_sds: the same amplitudes in prior sds.
+        sizes: amplitudes relative to the largest plausible ones [-].
+        rise_chi2: χ² minus that of the proposed fit [σ²]. Negative if these effects explain more.
+        reasons: reasons why they are implausible.
+    """
+
+    JSON = ("effects", "prior_sds", "sizes", "rise_chi2", "why")
+    effects: dict[str, float]
+    prior_sds: dict[str, float]
+    sizes: dict[str, float]
+    rise_chi2: float
+    reasons: tuple[RuledOut, ...] = ()
+
+    @property
+    def why(self) -> str:
+        """Reasons why they are implausible, as a sentence."""
+        return described.describe(self)
 
 
 def listed_alternatives(
@@ -203,20 +335,31 @@ def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
 # --- the base and the library ---------------------------------------------------------------------------
 
 
-def evidence_of_test(test: adequacy.AdequacyTest, adequate: bool) -> result.Evidence:
-    """Strongest statistic of each kind, its critical value, and its p-value by bootstrap."""
-    kinds = {
-        kind: result.KindOfEvidence(
-            float(getattr(test.found, kind)), test.threshold(kind), test.p(kind), np.asarray(getattr(test.null, kind))
-        )
-        for kind in test.settings.shares
-    }
-    return result.Evidence(kinds, test.p_value, adequate)
+@dataclasses.dataclass(frozen=True)
+class ParameterShift:
+    """A base parameter before and after effects were added: value in its unit, and distance from its prior [prior
+    sds].
+
+    Attributes:
+        held_by_prior: True if the data do not determine it after, see `identifiability.held_by_prior`.
+        at_bound: bound at which it is after, `lower`, `upper` or None.
+    """
+
+    prior: float
+    before: float
+    after: float
+    unit: str
+    sd_after: float
+    meaning: str
+    shift_before: float
+    shift_after: float
+    held_by_prior: bool
+    at_bound: str | None
 
 
 def parameter_shifts(
     space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd: np.ndarray
-) -> dict[str, result.ParameterShift]:
+) -> dict[str, ParameterShift]:
     """Every base parameter before and after effects were added, in its unit and in prior sds.
 
     Args:
@@ -230,7 +373,7 @@ def parameter_shifts(
     fields, held_names = params.parameters_by_name(space.bare.base), held_by_prior(sd)
     bound = coordinates.beyond(z[1])
     return {
-        name: result.ParameterShift(
+        name: ParameterShift(
             prior=float(value[0][k]),
             before=float(value[1][k]),
             after=float(value[2][k]),
@@ -246,7 +389,34 @@ def parameter_shifts(
     }
 
 
-def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[result.EffectScore, ...]:
+@dataclasses.dataclass(frozen=True)
+class EffectScore:
+    """Score of a library effect alone. All other parameters are refitted on the linearised equations of the base fit.
+
+    Attributes:
+        name: name of the effect.
+        balance: balance that it enters.
+        score: decrease of χ² by the effect at its best shape and plausible size [σ²].
+        amplitude, sd: its amplitude and standard deviation [unit].
+        sigmas_per_prior_sd: change of the readings per prior sd [σ].
+        family: equation and driving variable in words.
+        unit: unit of its amplitude.
+        supplies: True if its sign would supply power. It then explains nothing.
+    """
+
+    JSON = ("name", "balance", "score", "amplitude", "sigmas_per_prior_sd")
+    name: str
+    balance: str
+    score: float
+    amplitude: float
+    sigmas_per_prior_sd: float
+    sd: float
+    family: str
+    unit: str
+    supplies: bool = False
+
+
+def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
     """Score of each effect at its best shape and a plausible amplitude, strongest first. Equal scores are sorted by
     name.
     """
@@ -259,7 +429,7 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
         amplitude = min(max(best_amplitude, low), settings.plausible)
         explained = float(scores.single[m] ** 2 - ((best_amplitude - amplitude) * sigmas) ** 2)
         score_list.append(
-            result.EffectScore(
+            EffectScore(
                 name=effect.name,
                 balance=effect.balance,
                 score=max(explained, 0.0),
@@ -273,6 +443,32 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
             )
         )
     return tuple(sorted(score_list, key=lambda s: (-round(s.score, 9), s.name)))
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectRanking:
+    """Ranking of the library by regression, before any set of effects is fitted. It is not confirmed by simulation.
+
+    Attributes:
+        missing: True if an effect is missing.
+        p_value: family-wise p-value of the test for a missing effect.
+        chance: critical score of the strongest effect [σ²].
+        effects: effects by score, strongest first. Effects that would supply power come last.
+        windows: number of equations in weak form. 0 if the ranking uses the sensitivities of the base fit.
+        parameters: base parameters fitted together with the first effect, with their sds [SI].
+    """
+
+    missing: bool
+    p_value: float
+    chance: float
+    effects: tuple[EffectScore, ...]
+    windows: int = 0
+    parameters: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+
+    @property
+    def beyond_chance(self) -> list[EffectScore]:
+        """Effects that explain more than chance."""
+        return [e for e in self.effects if e.score > self.chance and not e.supplies]
 
 
 def rank_library(space: CandidateSpace, left: adequacy.Diagnosis, settings: Settings) -> EffectRanking:
@@ -294,13 +490,13 @@ def rank_effects_by_weak_form(
     return EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
 
 
-def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[result.EffectScore, ...]:
+def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
     """Effects sorted by score. Effects that would supply power come last."""
     return tuple(sorted(effect_scores(space, scores, settings), key=lambda e: e.supplies))
 
 
 def invisible_effects(
-    space: CandidateSpace, scores: ScoreTable, by_effect: Sequence[result.EffectScore], settings: Settings
+    space: CandidateSpace, scores: ScoreTable, by_effect: Sequence[EffectScore], settings: Settings
 ) -> Names:
     """Effects that the data cannot reveal, because even their largest plausible amplitude hardly changes the
     readings.

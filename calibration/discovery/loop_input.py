@@ -102,7 +102,6 @@ def prepare_loop(
     library: Library = effects.BY_NAME,
     replicates: int = 500,
     seed: int = 0,
-    prefer: str = settings_room.FIT,
     forbidden: Sequence[str] = (),
     rows: int = columns.ROWS,
     settled: fit_notes.Notes = (),
@@ -135,7 +134,7 @@ def prepare_loop(
     library = {**library, **kind.library, **channel_effects}
     library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, output_turn)
     settings = dataclasses.replace(
-        settings_room.settings_for(kind, replicates, seed, prefer),
+        settings_room.settings_for(kind, replicates, seed),
         forbidden=tuple(forbidden),
         silent=tuple(c.name for c in ready.noise.silent),
     )

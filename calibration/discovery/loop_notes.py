@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +12,13 @@ import numpy as np
 from calibration.data import Names
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.outliers import OutlierCluster
+from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.fit_notes import Remark
 
 # --- the verdict ----------------------------------------------------------------------------------------
+
+#: Verdicts without a missing effect.
+WITHOUT_CLAIM = ("none", "undescribed")
 
 
 class PlacedCurve(NamedTuple):
@@ -157,11 +161,6 @@ class NameSupport:
         """True if the name of an effect is established, by its own test if there is one."""
         test = self.test_of(effect)
         return self.stands and (not self.tests if test is None else test.established)
-
-    def with_leaders(self, names: Mapping[str, str]) -> NameSupport:
-        """Copy in which classes have other leading effects. A test applies to the whole class."""
-        tests = tuple(dataclasses.replace(t, effect=names.get(t.effect, t.effect)) for t in self.tests)
-        return dataclasses.replace(self, tests=tests)
 
     def with_row_numbers(self, numbers: np.ndarray) -> NameSupport:
         """Copy with row numbers as used in messages.
@@ -332,6 +331,72 @@ class Headline:
     shared: tuple[int, ...] = ()
     families: tuple[Names, ...] = ()
     values: tuple[tuple[AlternativeValue, ...], ...] = ()
+
+
+def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
+    """The most detailed claims that the verdicts at all noise levels share.
+
+    Args:
+        others: factor on the noise, and verdict, of each other noise level.
+    """
+    verdicts = [said, *(summary for _, summary in others)]
+    factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
+    if len({s.verdict if s.verdict in WITHOUT_CLAIM else "" for s in verdicts}) > 1:
+        return Headline("open", (), factors)
+    if said.verdict in WITHOUT_CLAIM:
+        return Headline(said.verdict, (), factors)
+    laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in verdicts])
+    if laws:
+        alone = all(len(names) == 1 for names in laws) and not any(
+            m.values or len(m.families) > len(m.names) for s in verdicts for m in s.missing
+        )
+        effects_of_laws = [
+            next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
+        ]
+        families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
+        return Headline("named" if alone else "class", laws, factors, (), families, values)
+    mechanisms, shared = _shared_claims([_claimed_families(s) for s in verdicts])
+    if mechanisms:
+        return Headline("mechanism", mechanisms, factors, shared)
+    places, shared = _shared_claims([_claimed_equations(s) for s in verdicts])
+    return Headline("place", places, factors, shared)
+
+
+def _claimed_families(said: VerdictSummary) -> list[Names]:
+    """Families of each established law or mechanism."""
+    families = [m.families for m in said.missing if m.established]
+    if said.verdict == "mechanism" and said.mechanism is not None:
+        families.append(said.mechanism.families)
+    return families
+
+
+def _claimed_equations(said: VerdictSummary) -> list[Names]:
+    """Equations with a discrepancy, in words, without their variable."""
+    families = _claimed_families(said)
+    if said.verdict in WITHOUT_NAME and said.where is not None:
+        families.append((said.where.family,))
+    return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
+
+
+def _shared_claims(
+    claims: Sequence[Sequence[Names]],
+) -> tuple[tuple[Names, ...], tuple[int, ...]]:
+    """Claims of the first verdict that every other verdict shares at least in part.
+
+    Members that all verdicts share come first, then those that some noise levels cannot separate from them. A claim
+    that is part of another is omitted. The second result is the number of agreed members of each claim.
+    """
+    counts: dict[Names, int] = {}
+    for claim in claims[0]:
+        alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
+        if all(alike):
+            effect_names = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
+            shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
+            ordered_names = (*shared, *(n for n in effect_names if n not in shared))
+            if not any(set(ordered_names) <= set(other) for other in counts):
+                counts[ordered_names] = len(shared)
+    largest_claims = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}
+    return tuple(largest_claims), tuple(largest_claims.values())
 
 
 @dataclasses.dataclass(frozen=True)

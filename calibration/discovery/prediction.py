@@ -186,27 +186,6 @@ def smallest_predictive_set(
 
 
 @dataclasses.dataclass(frozen=True)
-class HeldOutAlternative:
-    """An alternative set of effects, refitted without each block of runs.
-
-    Attributes:
-        effects: names of its effects.
-        leads: True if it is the proposed one.
-        rise_chi2: χ² of its fit to all rows, minus that of the best one [σ²].
-        rms_sigma: rms hold-out error over the readings that every alternative predicts [σ].
-        by_kind: the same error for each kind of block [σ].
-        lost: number of held-out readings that it cannot predict, because its robot slides or fails there.
-    """
-
-    effects: Names
-    leads: bool
-    rise_chi2: float
-    rms_sigma: float
-    by_kind: dict[str, float]
-    lost: int
-
-
-@dataclasses.dataclass(frozen=True)
 class ReadingsOfRows:
     """Readings of all rows [SI], shape (rows, channels), NaN if missing.
 

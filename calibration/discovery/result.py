@@ -11,13 +11,13 @@ from calibration import described
 from calibration.data import Json, Names, columns, posterior_file, writing
 from calibration.data.robot_file import write_robot
 from calibration.data.runs import Runs
-from calibration.discovery import REFIT_FILE, formula, loop_notes, prediction
+from calibration.discovery import REFIT_FILE, findings, loop_notes, prediction
+from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.settings import Settings
-from calibration.discovery.verdict import headline
 from calibration.inference import fit_notes
 from calibration.inference.details import Detail
 from calibration.inference.identifiability import determined_together
@@ -27,240 +27,6 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 SCHEMA = "mmrjax.loop/4"
-
-
-@dataclasses.dataclass(frozen=True)
-class ParameterEstimate:
-    """Fitted value of a parameter with its standard deviation, both in `unit`. `held_by_prior`: True if the data do
-    not determine it.
-    """
-
-    value: float
-    sd: float
-    unit: str
-    held_by_prior: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class ClassMember:
-    """An effect that explains the data as well as the leading effect of its class.
-
-    Attributes:
-        amplitude: fitted amplitude [unit].
-        size: amplitude relative to the largest plausible one [-].
-        rise_chi2: rise of χ² compared with the leading effect [σ²].
-    """
-
-    amplitude: float
-    size: float
-    rise_chi2: float
-
-
-@dataclasses.dataclass(frozen=True)
-class StatedValue:
-    """A stated value of the robot that may be wrong, in place of a missing effect.
-
-    Attributes:
-        value: value that explains the data.
-        stated: stated value, the mean of its prior. Both are in `unit`.
-        prior_sds: their distance in prior sds.
-        rise_chi2: rise of χ² compared with the effect [σ²].
-    """
-
-    value: float
-    stated: float
-    unit: str
-    prior_sds: float
-    rise_chi2: float
-
-
-@dataclasses.dataclass(frozen=True)
-class FoundEffect:
-    """An effect that the loop added to the model, with its alternatives and evidence.
-
-    Attributes:
-        name: name of the leading effect of its class.
-        members: the effect and all effects that the data cannot separate from it.
-        stated: base parameters, by name, whose stated value may be wrong instead.
-        families: families of the members, the leading one first. If there is only one, the equation and its driving
-            variable are known.
-        balance, unit: balance that the effect enters, and its unit.
-        equation, source: equation and source, from the effect's docstring.
-        parameters: fitted amplitude and shape.
-        p_value: share of bootstrap tables in which the strongest effect explains as much.
-        score: rise of χ² if the effect is removed and the rest refitted [σ²].
-        share: share of the excess misfit (χ² minus its expectation) that it explains [-].
-    """
-
-    name: str
-    members: dict[str, ClassMember]
-    stated: dict[str, StatedValue]
-    families: Names
-    balance: str
-    unit: str
-    equation: str
-    source: str
-    parameters: dict[str, ParameterEstimate]
-    p_value: float
-    score: float
-    share: float
-
-
-@dataclasses.dataclass(frozen=True)
-class UnnamedDiscrepancy(DiscrepancyLocation):
-    """A discrepancy that no effect of the library explains.
-
-    Attributes:
-        unit: unit of the balance.
-        effect: name of the smooth curve in the proposed robot.
-        p_value: family-wise p-value.
-        score: decrease of χ² by the curve [σ²].
-        at: values of the variable [SI].
-        value, sd: value and standard deviation of the curve there [unit].
-        proposal: proposed formula.
-        over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
-            plus the row's residual, along the travel. None if single rows do not show it.
-    """
-
-    unit: str
-    effect: str
-    p_value: float
-    score: float
-    at: np.ndarray
-    value: np.ndarray
-    sd: np.ndarray
-    proposal: formula.Proposal
-    over: np.ndarray | None = None
-    defect: np.ndarray | None = None
-    defect_sd: np.ndarray | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class RejectedCandidate:
-    """Effects that were fitted but are not proposed.
-
-    Attributes:
-        effects: amplitude of each effect.
-        prior_sds: the same amplitudes in prior sds.
-        sizes: amplitudes relative to the largest plausible ones [-].
-        rise_chi2: χ² minus that of the proposed fit [σ²]. Negative if these effects explain more.
-        reasons: reasons why they are implausible.
-    """
-
-    JSON = ("effects", "prior_sds", "sizes", "rise_chi2", "why")
-    effects: dict[str, float]
-    prior_sds: dict[str, float]
-    sizes: dict[str, float]
-    rise_chi2: float
-    reasons: tuple[loop_notes.RuledOut, ...] = ()
-
-    @property
-    def why(self) -> str:
-        """Reasons why they are implausible, as a sentence."""
-        return described.describe(self)
-
-
-@dataclasses.dataclass(frozen=True)
-class ParameterShift:
-    """A base parameter before and after effects were added: value in its unit, and distance from its prior [prior
-    sds].
-
-    Attributes:
-        held_by_prior: True if the data do not determine it after, see `identifiability.held_by_prior`.
-        at_bound: bound at which it is after, `lower`, `upper` or None.
-    """
-
-    prior: float
-    before: float
-    after: float
-    unit: str
-    sd_after: float
-    meaning: str
-    shift_before: float
-    shift_after: float
-    held_by_prior: bool
-    at_bound: str | None
-
-
-@dataclasses.dataclass(frozen=True)
-class EffectScore:
-    """Score of a library effect alone. All other parameters are refitted on the linearised equations of the base fit.
-
-    Attributes:
-        name: name of the effect.
-        balance: balance that it enters.
-        score: decrease of χ² by the effect at its best shape and plausible size [σ²].
-        amplitude, sd: its amplitude and standard deviation [unit].
-        sigmas_per_prior_sd: change of the readings per prior sd [σ].
-        family: equation and driving variable in words.
-        unit: unit of its amplitude.
-        supplies: True if its sign would supply power. It then explains nothing.
-    """
-
-    JSON = ("name", "balance", "score", "amplitude", "sigmas_per_prior_sd")
-    name: str
-    balance: str
-    score: float
-    amplitude: float
-    sigmas_per_prior_sd: float
-    sd: float
-    family: str
-    unit: str
-    supplies: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class EffectRanking:
-    """Ranking of the library by regression, before any set of effects is fitted. It is not confirmed by simulation.
-
-    Attributes:
-        missing: True if an effect is missing.
-        p_value: family-wise p-value of the test for a missing effect.
-        chance: critical score of the strongest effect [σ²].
-        effects: effects by score, strongest first. Effects that would supply power come last.
-        windows: number of equations in weak form. 0 if the ranking uses the sensitivities of the base fit.
-        parameters: base parameters fitted together with the first effect, with their sds [SI].
-    """
-
-    missing: bool
-    p_value: float
-    chance: float
-    effects: tuple[EffectScore, ...]
-    windows: int = 0
-    parameters: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
-
-    @property
-    def beyond_chance(self) -> list[EffectScore]:
-        """Effects that explain more than chance."""
-        return [e for e in self.effects if e.score > self.chance and not e.supplies]
-
-
-@dataclasses.dataclass(frozen=True)
-class KindOfEvidence:
-    """Strongest statistic of one kind: its value, critical value and p-value, and its values for the bootstrap
-    tables.
-    """
-
-    JSON = ("found", "threshold", "p")
-    found: float
-    threshold: float
-    p: float
-    null: np.ndarray
-
-
-@dataclasses.dataclass(frozen=True)
-class Evidence:
-    """Evidence for a missing effect in the residuals of a fit, by kind and family-wise. `adequate`: True if none is
-    significant.
-    """
-
-    kinds: dict[str, KindOfEvidence]
-    p_value: float
-    adequate: bool
-
-    def to_json(self) -> Json:
-        """Entry of result.json."""
-        return {**self.kinds, "p_value": self.p_value}
 
 
 Errors = dict[str, dict[str, float | int]]
@@ -314,7 +80,7 @@ class DiscoveryResult:
         support: tests of the effects' names. None if no name was tested.
         cluster: property that the outliers share. They were then not excluded. None if there is none.
         residual_clusters: groups of rows with similar residuals, by columns that the model does not use.
-        before, after: evidence for a missing effect in the residuals without and with the proposal.
+        before, after: tests of the residuals without and with the proposal.
         chi2: twice the objective without and with the proposal [σ²].
         readings: number of included readings.
         base_shift: each base parameter without and with the proposal.
@@ -325,8 +91,6 @@ class DiscoveryResult:
         errors, errors_held_out: rms by channel, before and after, over the rows that both predict. By kind of block.
         held_out_unpredictable: kinds of block with at least one block that the others cannot predict.
         held_out_worse: channels whose hold-out error rises.
-        alternatives_held_out: alternatives with their hold-out errors. Empty if there is only one, or for histories
-            unless requested.
         noise: channel → source of its sd, and its median relative size [%].
         settings: statistical constants of the loop.
         replicates: number of bootstrap tables whose refit converged.
@@ -347,33 +111,32 @@ class DiscoveryResult:
     included: np.ndarray
     outliers: tuple[int, ...]
     unusable: tuple[int, ...]
-    effects: tuple[FoundEffect, ...]
-    unnamed: UnnamedDiscrepancy | None
+    effects: tuple[findings.FoundEffect, ...]
+    unnamed: findings.UnnamedDiscrepancy | None
     remains: DiscrepancyLocation | None
     next_experiment: Proposal | None
     cannot_see: Names
     needs_histories: Names
     needs_reverse: Names
-    alternatives: tuple[RejectedCandidate, ...]
-    implausible: tuple[RejectedCandidate, ...]
+    alternatives: tuple[findings.RejectedCandidate, ...]
+    implausible: tuple[findings.RejectedCandidate, ...]
     hidden: tuple[HiddenEffect, ...]
     support: loop_notes.NameSupport | None
     cluster: OutlierCluster | None
     residual_clusters: tuple[ResidualCluster, ...]
-    before: Evidence
-    after: Evidence
+    before: AdequacyTest
+    after: AdequacyTest
     chi2: tuple[float, float]
     readings: int
-    base_shift: dict[str, ParameterShift]
-    scores: tuple[EffectScore, ...]
+    base_shift: dict[str, findings.ParameterShift]
+    scores: tuple[findings.EffectScore, ...]
     detail: Detail
     readings_of_rows: prediction.ReadingsOfRows
     errors_as_stated: Errors
-    errors: tuple[Errors, Errors]
-    errors_held_out: dict[str, tuple[Errors, Errors]]
+    errors: tuple[Errors, ...]
+    errors_held_out: dict[str, tuple[Errors, ...]]
     held_out_unpredictable: Names
     held_out_worse: tuple[WorseChannel, ...]
-    alternatives_held_out: tuple[prediction.HeldOutAlternative, ...]
     noise: dict[str, Json]
     settings: Settings
     replicates: int
@@ -396,7 +159,7 @@ class DiscoveryResult:
     @property
     def headline(self) -> loop_notes.Headline:
         """The claims that hold at every noise level tried."""
-        return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
+        return loop_notes.headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
 
     @property
     def gain(self) -> prediction.Gain | None:
@@ -404,9 +167,14 @@ class DiscoveryResult:
         return self.gains[-1][1] if self.gains else None
 
     @property
+    def adequate_after(self) -> bool:
+        """True if the residuals with the proposal do not exceed the noise by the margin of the test."""
+        return not self.after.rejected_with_margin
+
+    @property
     def refit_alone(self) -> bool:
         """True if the loop proposes no effect and no curve."""
-        return self.verdict in ("none", "undescribed")
+        return self.verdict in loop_notes.WITHOUT_CLAIM
 
     @property
     def standing(self) -> str:
@@ -459,7 +227,7 @@ class DiscoveryResult:
         return tuple(name for name, p in self._parameters.items() if p.held_by_prior)
 
     @property
-    def _parameters(self) -> dict[str, ParameterShift | ParameterEstimate]:
+    def _parameters(self) -> dict[str, findings.ParameterShift | findings.ParameterEstimate]:
         """Fitted parameters of the base and of the effects, by name."""
         of_effects = {f"effects.{e.name}.{name}": p for e in self.effects for name, p in e.parameters.items()}
         return {**self.base_shift, **of_effects}
@@ -516,7 +284,7 @@ class DiscoveryResult:
                     kind: {"before": before, "after": after, "blocks": self.readings_of_rows.blocks[kind]}
                     for kind, (before, after) in self.errors_held_out.items()
                 },
-                **writing.entries_of(self, "held_out_unpredictable", "held_out_worse", "alternatives_held_out"),
+                **writing.entries_of(self, "held_out_unpredictable", "held_out_worse"),
                 "prediction": {
                     "gain": self.gain and self.gain.mean,
                     "se": self.gain and self.gain.se,
@@ -524,7 +292,7 @@ class DiscoveryResult:
                     "unit": "nat a reading",
                     "written": "found" if self.written else "refit",
                 },
-                "adequate": writing.entries_of(self, "before=before.adequate", "after=after.adequate"),
+                "adequate": {"before": not self.before.rejected, "after": self.adequate_after},
                 "evidence": writing.entries_of(self, "before", "after"),
                 "chi2": {
                     "before": self.chi2[0],
@@ -611,7 +379,7 @@ class NoiseVerdict:
         return writing.entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
 
 
-def _effect_json(e: FoundEffect, support: loop_notes.NameSupport | None) -> Json:
+def _effect_json(e: findings.FoundEffect, support: loop_notes.NameSupport | None) -> Json:
     test = None if support is None else support.test_of(e.name)
     form = test is not None and test.shows_form
     return {
@@ -630,7 +398,7 @@ def _effect_json(e: FoundEffect, support: loop_notes.NameSupport | None) -> Json
     }
 
 
-def _unnamed_json(d: UnnamedDiscrepancy, course: str) -> Json:
+def _unnamed_json(d: findings.UnnamedDiscrepancy, course: str) -> Json:
     return {
         "name": "unnamed",
         "class": [],

@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from calibration.data.runs import Runs
+from calibration.discovery.findings import ParameterShift
 from calibration.discovery.loop_notes import NameTest
 from calibration.discovery.prediction import ReadingsOfRows
-from calibration.discovery.result import DiscoveryResult, ParameterShift
-from calibration.discovery.verdict import FAR, VerdictNoise
+from calibration.discovery.result import DiscoveryResult
+from calibration.discovery.verdict import FAR, LoopStages, VerdictNoise
 from calibration.inference import noise as noise_room
 from calibration.inference import priors, series_noise
 from calibration.inference.conduct import error_after_steps
@@ -68,9 +69,20 @@ def noise_remarks_before_verdict(sds: VerdictNoise, remaining: Residuals) -> tup
     return off
 
 
-def loop_remarks(found: DiscoveryResult) -> Notes:
-    """Remarks on the result that help to judge it."""
-    remarks: list[Remark] = []
+def loop_remarks(found: DiscoveryResult, traced: LoopStages, noise: Noise, remaining: Residuals) -> Notes:
+    """Remarks on the result that help to judge it.
+
+    Args:
+        noise: noise of the readings.
+        remaining: residuals of the final fit.
+    """
+    remarks, sds, run = list[Remark](), traced.sds, traced.run
+    if run is not None and run.contradicts:
+        remarks.append(Remark("contradicted", promised=run.promised, gained=run.gained))
+    is_event = traced.where is not None and traced.where.window is not None
+    if sds.factors or not is_event:  # a temporary change is not uniform
+        remarks += noise_remarks_before_verdict(sds, remaining)
+    remarks += worse_than_stated(found.readings_of_rows, noise, found.included)
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
             remarks.append(Remark("kept_out", rows=rows, why=why))

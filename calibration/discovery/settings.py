@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 from calibration.data import Names
-from calibration.data.input_errors import SEEDS, stated_count, stated_word
+from calibration.data.input_errors import SEEDS, stated_count
 from calibration.inference.observers import Observer
 
 #: Family-wise error of the test for a missing effect, divided among the kinds of evidence: single effects, curves,
@@ -17,8 +17,6 @@ SHARES = {
 }
 #: Verdicts with a missing effect, none of which is established.
 WITHOUT_NAME = ("mechanism", "place")
-#: Criteria for the leader of a class.
-PREFERENCES = FIT, HELD_OUT = ("fit", "held-out")
 #: Margin above its threshold at which a statistic rejects a fit with effects. A residual effect of two sigmas right
 #: on the threshold would otherwise flip the verdict, at a family-wise error of about 1 %.
 MARGINS = {"single": 0.5, "curve": 0.7, "pair": 6.0, "chi2": 10.0, "white": 1.0}
@@ -59,7 +57,6 @@ class Settings:
         enough, gain: probability above which a better separation is no gain, and least increase of the expected
             number of separated pairs by a second experiment.
         refuted: rise of χ² that refutes an alternative [σ²].
-        prefer: criterion for the leading effect, one of `PREFERENCES`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that must not be proposed.
         silent: channels without a stated noise.
     """
@@ -94,7 +91,6 @@ class Settings:
     enough: float = 0.95
     gain: float = 0.2
     refuted: float = 4.0
-    prefer: str = FIT
     forbidden: Names = ()
     silent: Names = ()
 
@@ -125,15 +121,13 @@ def fewest_replicates(kind: type[Observer]) -> int:
     return math.ceil(1 / min(SHARES[kind.evidence])) - 1
 
 
-def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, prefer: str = FIT) -> Settings:
+def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0) -> Settings:
     """Settings of the loop for one kind of data.
 
     Raises:
-        BadConfiguration: `prefer` is not one of `PREFERENCES`, or the number of replicates or the seed is out of
-            range.
+        BadConfiguration: the number of replicates or the seed is out of range.
     """
     stated_count(replicates, "replicates", 1, 100_000)
     stated_count(seed, "seed", 0, SEEDS)
-    stated_word(prefer, PREFERENCES, "--prefer")
     shares = dict(zip(kind.evidence, SHARES[kind.evidence], strict=True))
-    return Settings(shares, replicates=replicates, seed=seed, prefer=prefer)
+    return Settings(shares, replicates=replicates, seed=seed)

@@ -1,10 +1,10 @@
-"""Stages of the loop: from the fit of the base to the claim, see `discover.STAGES`."""
+"""Stages of the loop: from the fit of the base to the verdict, see `discover.trace_verdict`."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+import itertools
 
 import numpy as np
 
@@ -13,10 +13,8 @@ from calibration.discovery import (
     classes,
     discrepancy,
     findings,
-    loop_notes,
     outliers,
     prediction,
-    preference,
     search,
     verdict,
 )
@@ -24,11 +22,13 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import varied_by_duty
 from calibration.discovery.loop_input import LoopInput
+from calibration.discovery.loop_notes import NameSupport
 from calibration.discovery.mechanism import find_mechanism
 from calibration.discovery.outliers import Screening
 from calibration.discovery.search import Proposed, SearchResult
-from calibration.discovery.settings import HELD_OUT
-from calibration.discovery.verdict import VerdictNoise
+from calibration.discovery.standing import judge_names
+from calibration.discovery.verdict import LoopStages, VerdictNoise
+from calibration.inference import blocks as blocks_room
 from calibration.inference.fit_notes import progress_remark
 from calibration.inference.lack_of_fit import common_factors, noise_remarks
 from calibration.inference.noise import Noise
@@ -92,17 +92,30 @@ def search_until_clean(
     backlash that the robot lacks.
     """
     settings, keep, progress = given.settings, given.keep, given.progress
+
+    def test_base(screened: Screening) -> tuple[Screening, Diagnosis]:
+        """Tests the base fit by bootstrap. If an effect is probably missing, also compiles later programs."""
+        known_stages, null = given.known, None
+        if known_stages is not None and np.all(known_stages.screened.base.space.weight == screened.base.space.weight):
+            null = known_stages.left.test.null
+        if np.max(np.abs(screened.diagnosed[1].single)) > LIKELY:
+            while given.later:
+                given.later.pop()(screened.base)
+        return screened, outliers.diagnose_base_by_bootstrap(screened, settings, sds.noise.freedom, null)
+
+    def search_effects(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, SearchResult]:
+        space, base = screened.base.space, screened.base.candidate
+        return screened, left, search.search_effects(space, base, left, screened.bases, settings, progress)
+
     for k in range(SCREENINGS):
         progress(progress_remark("bootstrap", settings.replicates))
-        screened, diagnosis = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
+        screened, diagnosis = keep(f"bootstrap {k}", functools.partial(test_base, screened))
         if k == 0 and not given.ranked and not given.shows_unmodelled_backlash:
             keep("ranking", functools.partial(findings.rank_library, screened.base.space, diagnosis, settings))
         if given.shows_unmodelled_backlash or (not diagnosis.test.rejected and screened.cluster is None):
             return screened, diagnosis, None  # effects of the library would only stand in for a backlash
         progress(progress_remark("effects"))
-        screened, diagnosis, searched = keep(
-            f"search {k}", functools.partial(_search_effects, given, screened, diagnosis)
-        )
+        screened, diagnosis, searched = keep(f"search {k}", functools.partial(search_effects, screened, diagnosis))
         after = searched.diagnosis
         if after is None or not after.test.rejected_with_margin:
             break
@@ -114,144 +127,107 @@ def search_until_clean(
     return screened, diagnosis, searched
 
 
-def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tuple[Screening, Diagnosis]:
-    """Tests the base fit by bootstrap. If an effect is probably missing, also compiles programs of later stages."""
-    known_stages, weight = given.known, screened.base.space.weight
-    null = (
-        None
-        if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
-        else known_stages.left.test.null
-    )
-    if np.max(np.abs(screened.diagnosed[1].single)) > LIKELY:
-        while given.later:
-            given.later.pop()(screened.base)
-    return screened, outliers.diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)
-
-
-def _search_effects(
-    given: LoopInput, screened: Screening, left: Diagnosis
-) -> tuple[Screening, Diagnosis, SearchResult]:
-    """Searches for effects that explain the residuals of the base fit."""
-    space, base = screened.base.space, screened.base.candidate
-    return screened, left, search.search_effects(space, base, left, screened.bases, given.settings, given.progress)
-
-
-def end_without_search(
-    given: LoopInput,
-    screened: Screening,
-    left: Diagnosis,
-    sds: VerdictNoise,
-    searched: SearchResult | None,
-) -> verdict.LoopStages | None:
-    """Verdict on a base without a search for effects: nothing is missing, or the model does not describe the runs."""
-    if searched is not None:
-        return None
-    missed = verdict.missed_channels(screened.base.space, given.runs, sds.noise, left.linear)
-    # If the rigid model leaves only noise, there is no backlash.
-    loose = given.shows_unmodelled_backlash and left.test.rejected
-    word = "undescribed" if missed or loose else "none"
-    return verdict.LoopStages(word, screened, left, sds, missed=missed, unused=verdict.unused_inputs(given.runs))
-
-
-def confirm_search(
-    given: LoopInput,
-    screened: Screening,
-    left: Diagnosis,
-    sds: VerdictNoise,
-    searched: SearchResult,
-) -> SearchResult:
-    """The search with the set of effects that a simulation confirms, for equations of a log."""
-    return searched if given.confirm is None else given.confirm(screened, left, searched, sds.noise)
-
-
-def curve_of_base(given: LoopInput, screened: Screening, left: Diagnosis) -> BaseCurve:
-    """Smooth curve of the base's discrepancy, which is fitted when it is needed."""
-    return BaseCurve(screened.base.space, screened.base.candidate, left, screened.bases)
-
-
-def check_described(
-    given: LoopInput,
-    sds: VerdictNoise,
-    searched: SearchResult,
-    chosen: Proposed | None,
-    beside: BaseCurve,
-    predicted: prediction.Predicted,
-    screened: Screening,
-) -> tuple[loop_notes.MissedChannel, ...] | verdict.LoopStages:
-    """Channels that the refit misses but effects describe. Ends the loop if no set of effects describes the runs."""
-    runs, space, left = given.runs, beside.space, beside.left
+def reach_verdict(
+    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: SearchResult | None
+) -> LoopStages:
+    """Verdict on the base: effects, classes of effects, a mechanism or a place. Without a search, nothing is missing,
+    or the model does not describe the runs.
+    """
+    runs, space, predicted = given.runs, screened.base.space, prediction.Predicted()
     missed = verdict.missed_channels(space, runs, sds.noise, left.linear)
-    if not missed:
-        return ()
-    given.progress(progress_remark("held out"))
-    refit = prediction.cached_hold_out_score(space, runs, beside.base, predicted)
-    sets = (chosen and chosen[0], searched.best, *search.best_of_each_size(searched))
-    for fit in {c.key: c for c in sets if c}.values():
-        with_effects = prediction.cached_hold_out_score(space, runs, fit, predicted)
-        if leaves := verdict.remaining_errors(space, runs, missed, refit, with_effects):
-            return leaves
-    return verdict.LoopStages(
-        "undescribed", screened, left, sds, searched, beside=beside, predicted=predicted, missed=missed,
-        unused=verdict.unused_inputs(runs),
-    )  # fmt: skip
-
-
-def trace_mechanism(
-    given: LoopInput,
-    searched: SearchResult,
-    chosen: Proposed | None,
-    standing: loop_notes.NameSupport,
-    beside: BaseCurve,
-    predicted: prediction.Predicted,
-) -> loop_notes.Mechanism | None:
-    """Equation and driving variable of the discrepancy. None if the name of an effect is established."""
-    if chosen is not None and any(map(standing.established, chosen[0].effects)):
-        return None
-    given.progress(progress_remark("mechanism"))
-    ladder = [*searched.ladder, *([] if chosen is None else chosen[:1])]
-    return find_mechanism(beside, given.runs, ladder, predicted)
-
-
-def find_alternatives(
-    given: LoopInput, searched: SearchResult, chosen: Proposed | None, beside: BaseCurve
-) -> tuple[SearchResult, classes.Classes | None]:
-    """The search with the chosen effects, and the alternatives to each of them. None without effects."""
+    if searched is None:
+        # If the rigid model leaves only noise, there is no backlash.
+        loose = given.shows_unmodelled_backlash and left.test.rejected
+        word = "undescribed" if missed or loose else "none"
+        return LoopStages(word, screened, left, sds, missed=missed, unused=verdict.unused_inputs(runs))
+    if given.confirm is not None:  # equations of a log: the set of effects that a simulation confirms
+        searched = given.confirm(screened, left, searched, sds.noise)
+    beside = BaseCurve(space, screened.base.candidate, left, screened.bases)
+    chosen, searched, standing = choose_effects(given, searched, beside, predicted)
+    if missed:
+        given.progress(progress_remark("held out"))
+        refit = prediction.cached_hold_out_score(space, runs, beside.base, predicted)
+        sets = (chosen and chosen[0], searched.best, *search.best_of_each_size(searched))
+        with_effects = (
+            prediction.cached_hold_out_score(space, runs, fit, predicted)
+            for fit in {c.key: c for c in sets if c}.values()
+        )
+        remaining = (verdict.remaining_errors(space, runs, missed, refit, score) for score in with_effects)
+        described = next(filter(None, remaining), None)
+        if described is None:
+            return LoopStages(
+                "undescribed", screened, left, sds, searched, beside=beside, predicted=predicted, missed=missed,
+                unused=verdict.unused_inputs(runs),
+            )  # fmt: skip
+        missed = described
+    traced = LoopStages(
+        "", screened, left, sds, searched, standing=standing, beside=beside, predicted=predicted, missed=missed
+    )
+    named = [] if chosen is None else [standing.established(e) for e in chosen[0].effects]
+    if not any(named):
+        given.progress(progress_remark("mechanism"))
+        ladder = [*searched.ladder, *([] if chosen is None else chosen[:1])]
+        mechanism = find_mechanism(beside, runs, ladder, predicted)
+        level = "place" if mechanism is None or mechanism.fails else "mechanism"
+        where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
+        traced = dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=where)
     if chosen is None:
-        return searched, None
+        return traced
     best, after = chosen
     given.progress(progress_remark("alike", best.effects))
     alike = classes.find_classes(beside, best, searched.ladder, after)
-    return dataclasses.replace(searched, best=best, diagnosis=after), alike
+    searched = dataclasses.replace(searched, best=best, diagnosis=after)
+    traced = dataclasses.replace(traced, searched=searched, alike=alike)
+    if not any(named):
+        return traced
+    rejected, is_alone = after.test.rejected_with_margin, all(itertools.compress(alike.alone, named))
+    rest = discrepancy.locate_discrepancy(after, beside.bases, space.included) if rejected else None
+    return dataclasses.replace(traced, verdict="named" if is_alone else "class", where=rest)
 
 
-def reach_verdict(
-    given: LoopInput,
-    searched: SearchResult,
-    chosen: Proposed | None,
-    alike: classes.Classes | None,
-    standing: loop_notes.NameSupport,
-    beside: BaseCurve,
-    mechanism: loop_notes.Mechanism | None,
-) -> tuple[Any, ...]:
-    """Verdict: effects, classes of effects, a mechanism, or a place. Hold-out errors may choose leading effects."""
-    named = [] if chosen is None else [standing.established(e) for e in chosen[0].effects]
-    if chosen is None or alike is None or not any(named):
-        level = "place" if mechanism is None or mechanism.fails else "mechanism"
-        return (
-            level,
-            searched,
-            alike,
-            standing,
-            dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs)),
-            (),
-        )
-    (best, after), held_out = chosen, verdict.LoopStages.held_out
-    if given.settings.prefer == HELD_OUT:
-        given.progress(progress_remark("held out"))
-        leading, after, alike, held_out = preference.prefer_by_held_out(beside, given.runs, best, after, alike)
-        searched = dataclasses.replace(searched, best=leading, diagnosis=after)
-        standing = standing.with_leaders(dict(zip(best.active, leading.active, strict=True)))
-    rejected = after.test.rejected_with_margin
-    rest = discrepancy.locate_discrepancy(after, beside.bases, beside.space.included) if rejected else None
-    alone = all(one for one, name in zip(alike.alone, named, strict=True) if name)
-    return "named" if alone else "class", searched, alike, standing, rest, held_out
+def choose_effects(
+    given: LoopInput, searched: SearchResult, beside: BaseCurve, predicted: prediction.Predicted
+) -> tuple[Proposed | None, SearchResult, NameSupport]:
+    """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
+
+    The effects are those whose names are established, and those of the smallest set that predicts as well as any.
+    Effects that only imitate a curve are left out. If the largest set leaves no discrepancy, its effects are tested,
+    otherwise those of the predictive set.
+
+    Args:
+        beside: the base fit, its diagnosis and the smooth curve of its discrepancy.
+        predicted: cache of hold-out predictions of fits. This function adds to it.
+    """
+    space, base, settings = beside.space, beside.base, given.settings
+    best, after = searched.best, searched.diagnosis
+    if best is None or after is None:
+        return None, searched, judge_names(beside, searched)
+    adequate = not after.test.rejected_with_margin
+    blocks = prediction.masks_of_blocks(blocks_room.predictable_blocks(given.runs, space.bare))
+    stood = judge_names(beside, searched, blocks=blocks) if adequate else None
+    if stood is not None and all(map(stood.established, best.effects)):
+        return (best, after), searched, stood
+
+    def diagnosed(fit: candidates.Candidate) -> Proposed:
+        return fit, after if fit is best else search.diagnose_candidate(space, fit, beside.bases, beside.left)
+
+    given.progress(progress_remark("held out"))
+    path = search.best_of_each_size(searched)
+    few = prediction.smallest_predictive_set(space, given.runs, base, path, predicted)
+    proposed = best, after
+    if stood is None:
+        proposed = diagnosed(best if few is None else few)
+        stood = judge_names(beside, searched, proposed, blocks)
+    names = [e for e in proposed[0].effects if stood.established(e)]
+    predictive = () if few is None else few.effects
+    added_effects = [e for e in predictive if e not in names and not stood.imitates_curve(e)]
+    names += added_effects[: settings.slots - len(names)]
+    if not names:
+        return None, searched, stood
+    fit = next((c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)), None)
+    if fit is None:
+        active = candidates.fill_slots(names, settings)
+        begins = candidates.start_of_fit(space, proposed[0], active, settings, beside.left.scores)
+        (fit,) = candidates.fit_candidates(space, [(active, begins)], settings)
+        searched = dataclasses.replace(searched, ladder=(*searched.ladder, fit))
+    return proposed if fit is proposed[0] else diagnosed(fit), searched, stood

@@ -19,9 +19,9 @@ from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.log_simulation import LogSimulation
-from calibration.discovery.loop_notes import Headline, VerdictSummary
+from calibration.discovery.loop_notes import VerdictSummary
 from calibration.discovery.outliers import Screening
-from calibration.discovery.prediction import HeldOutAlternative, HeldOutScore, Predicted
+from calibration.discovery.prediction import HeldOutScore, Predicted
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import checks as unused_room
 from calibration.inference.fit_notes import Remark
@@ -56,10 +56,10 @@ PENDING: Any = None
 
 @dataclasses.dataclass(frozen=True)
 class LoopStages:
-    """Results of the stages of the loop, in the order of `discover.STAGES`.
+    """Results of the stages of the loop, in the order of `discover.trace_verdict`.
 
     Attributes:
-        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`. Empty before the last stage.
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         screened: base fit without outliers.
         left: diagnosis of the base fit.
         sds: noise behind the verdict.
@@ -67,7 +67,6 @@ class LoopStages:
         alike: alternatives to the effects found, if effects are named.
         where: location of the discrepancy, or of the rest that the effects leave.
         standing: tests of the effects' names.
-        held_out: alternatives ordered by hold-out error, if these errors chose the leading effect.
         beside: smooth curve of the discrepancy of the base, if there is one.
         predicted: hold-out predictions of fits, as from `prediction.smallest_predictive_set`.
         mechanism: equation and driving variable, if no effect is established. They need not be established either.
@@ -76,8 +75,6 @@ class LoopStages:
         unused: numeric columns that vary and have no role.
         run: simulation of a log, whose verdict comes from its equations.
         settled: True if settled runs replace a log.
-        begin: start of a log's simulated fit: the fit of the base to its windows.
-        chosen: fit of the effects to add and its diagnosis, None for no effects.
     """
 
     verdict: str = ""
@@ -88,7 +85,6 @@ class LoopStages:
     alike: Classes | None = None
     where: DiscrepancyLocation | None = None
     standing: loop_notes.NameSupport | None = None
-    held_out: tuple[HeldOutAlternative, ...] = ()
     beside: BaseCurve | None = None
     predicted: Predicted = dataclasses.field(default_factory=dict)
     mechanism: loop_notes.Mechanism | None = None
@@ -96,8 +92,6 @@ class LoopStages:
     unused: Names = ()
     run: LogSimulation | None = None
     settled: bool = False
-    begin: Candidate | None = None
-    chosen: search.Proposed | None = None
 
     @property
     def members(self) -> tuple[Names, ...]:
@@ -181,77 +175,6 @@ def missing_effects(
         )
         for names, shifts, families in zip(alike.members, alike.stated, alike.families, strict=True)
     )
-
-
-def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
-    """The most detailed claims that the verdicts at all noise levels share.
-
-    Args:
-        others: factor on the noise, and verdict, of each other noise level.
-    """
-    sentences = [said, *(summary for _, summary in others)]
-    factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
-    if len({_verdict_without_claim(s) for s in sentences}) > 1:
-        return Headline("open", (), factors)
-    if _verdict_without_claim(said):
-        return Headline(said.verdict, (), factors)
-    laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in sentences])
-    if laws:
-        alone = all(len(names) == 1 for names in laws) and not any(
-            m.values or len(m.families) > len(m.names) for s in sentences for m in s.missing
-        )
-        effects_of_laws = [
-            next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
-        ]
-        families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
-        return Headline("named" if alone else "class", laws, factors, (), families, values)
-    mechanisms, shared = _shared_claims([_claimed_families(s) for s in sentences])
-    if mechanisms:
-        return Headline("mechanism", mechanisms, factors, shared)
-    places, shared = _shared_claims([_claimed_equations(s) for s in sentences])
-    return Headline("place", places, factors, shared)
-
-
-def _verdict_without_claim(said: VerdictSummary) -> str:
-    """Verdict if it claims no missing effect (`none` or `undescribed`), otherwise empty."""
-    return said.verdict if said.verdict in ("none", "undescribed") else ""
-
-
-def _claimed_families(said: VerdictSummary) -> list[Names]:
-    """Families of each established law or mechanism."""
-    families = [m.families for m in said.missing if m.established]
-    if said.verdict == "mechanism" and said.mechanism is not None:
-        families.append(said.mechanism.families)
-    return families
-
-
-def _claimed_equations(said: VerdictSummary) -> list[Names]:
-    """Equations with a discrepancy, in words, without their variable."""
-    families = _claimed_families(said)
-    if said.verdict in WITHOUT_NAME and said.where is not None:
-        families.append((said.where.family,))
-    return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
-
-
-def _shared_claims(
-    claims: Sequence[Sequence[Names]],
-) -> tuple[tuple[Names, ...], tuple[int, ...]]:
-    """Claims of the first verdict that every other verdict shares at least in part.
-
-    Members that all verdicts share come first, then those that some noise levels cannot separate from them. A claim
-    that is part of another is omitted. The second result is the number of agreed members of each claim.
-    """
-    counts: dict[Names, int] = {}
-    for claim in claims[0]:
-        alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
-        if all(alike):
-            effect_names = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
-            shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
-            ordered_names = (*shared, *(n for n in effect_names if n not in shared))
-            if not any(set(ordered_names) <= set(other) for other in counts):
-                counts[ordered_names] = len(shared)
-    largest_claims = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}
-    return tuple(largest_claims), tuple(largest_claims.values())
 
 
 #: Least share of the refit's error on unseen runs that effects have to remove where the refit misses a channel.

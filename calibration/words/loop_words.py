@@ -25,15 +25,8 @@ from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 if TYPE_CHECKING:
-    from calibration.discovery.result import (
-        DiscoveryResult,
-        EffectRanking,
-        Errors,
-        FoundEffect,
-        NoiseVerdict,
-        UnnamedDiscrepancy,
-        WorseChannel,
-    )
+    from calibration.discovery.findings import EffectRanking, FoundEffect, UnnamedDiscrepancy
+    from calibration.discovery.result import DiscoveryResult, Errors, NoiseVerdict, WorseChannel
     from calibration.discovery.verdict import LoopStages
 
 # --- the verdict ----------------------------------------------------------------------------------------
@@ -540,7 +533,7 @@ def support_reasons(support: loop_notes.NameSupport | None) -> str:
 def naming_reasons(found: DiscoveryResult) -> str:
     """Reasons for or against the names. A curve that explains everything comes first."""
     reasons, lacks = support_reasons(found.support), found.unnamed
-    if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
+    if lacks is None or not found.adequate_after or (found.support is not None and found.support.curves):
         return reasons
     placed_curve = loop_notes.PlacedCurve(lacks.place, (lacks.variable,))
     return "; ".join([REASONS["curve alone"].format(curves=_curve(placed_curve)), *[reasons] * bool(reasons)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from calibration.data.settling import Settled
-from calibration.discovery import formula, loop_notes
+from calibration.discovery import findings, formula, loop_notes
 from calibration.discovery import result as loop_results
 from calibration.inference import fit_notes
 from calibration.inference import result as fit_results
@@ -37,10 +37,10 @@ RESULTS: dict[type, Callable[..., str]] = {
     fit_results.PriorSummary: lambda prior: fit_words.PRIORS.get(prior.source, prior.source),
     loop_notes.Headline: loop_words.loop_answer,
     loop_notes.VerdictSummary: loop_words.verdict_sentences,
-    loop_results.RejectedCandidate: lambda found: loop_words.why_ruled_out(found.reasons),
+    findings.RejectedCandidate: lambda found: loop_words.why_ruled_out(found.reasons),
     loop_results.DiscoveryResult: lambda found: loop_words.loop_answer(found.headline),
     formula.Proposal: lambda found: found.expression or loop_words.NO_FORMULA,
-    loop_results.UnnamedDiscrepancy: loop_words.curve_course,
+    findings.UnnamedDiscrepancy: loop_words.curve_course,
     SensitivityResult: sensitivity_words.sensitivity_statement,
     Settled: table_words.settle_statement,
 }

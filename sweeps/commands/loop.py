@@ -18,7 +18,7 @@ from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.discovery import REFIT_FILE, OutOfTime, findings
 from calibration.discovery.discover import discover
-from calibration.discovery.result import DiscoveryResult, EffectRanking
+from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import observers, priors
 from calibration.inference.details import EquationErrors
@@ -97,7 +97,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             result = stages[name] = folder.stage(name, make)
             if name == "ranking":
                 # The ranking by regression is the first answer.
-                ranking: EffectRanking = stages[name]
+                ranking: findings.EffectRanking = stages[name]
                 first_line, *lines = loop_words.ranking_lines(ranking, brief=not beside.verbose)
                 timed(first_line)
                 for line in lines:
@@ -114,7 +114,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
                 verdict = discover(
                     runs, robot, rows=config.rows, noise=config.noise or None, stated=prior_options,
                     library=effect_file.effect_library(config.effects), replicates=replicates, seed=config.seed,
-                    prefer=config.prefer, forbidden=config.forbid, progress=progress, keep=keep, left=left,
+                    forbidden=config.forbid, progress=progress, keep=keep, left=left,
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):

@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.data import Columns
-from calibration.discovery.result import DiscoveryResult, UnnamedDiscrepancy
+from calibration.discovery.findings import UnnamedDiscrepancy
+from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics

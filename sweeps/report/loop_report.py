@@ -221,8 +221,8 @@ def _certainty_sections(found: DiscoveryResult) -> Iterable[Section]:
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
-    chi = " → ".join(f"{x:.0f}" for x in found.chi2_of_readings[: 1 + _is_missing(found)])
-    verb = "are consistent with" if found.after.adequate else "exceed"
+    chi = " → ".join(f"{x:.0f}" for x in found.chi2_of_readings[: 2 - found.refit_alone])
+    verb = "are consistent with" if found.adequate_after else "exceed"
     used, left_out = int(found.included.sum()), (len(found.unusable), len(found.outliers))
     rows = "samples" if isinstance(found.detail, TimeStatistics) else "runs"
     aside = " ({} without a result of the fitted model, {} set aside as outliers)".format(*left_out)
@@ -244,14 +244,10 @@ def _certainty_sections(found: DiscoveryResult) -> Iterable[Section]:
     yield Section("Before you use it", remarks(filter(None, notes)))
 
 
-def _is_missing(found: DiscoveryResult) -> bool:
-    return found.verdict not in ("none", "undescribed")
-
-
 def _sections(
     found: DiscoveryResult, table: Columns, run_by_run: Sequence[Block], missing_term: Sequence[Block]
 ) -> Iterable[Section]:
-    missing, sized = _is_missing(found), Layout.of(found.robot).crosses_zero
+    missing, sized = not found.refit_alone, Layout.of(found.robot).crosses_zero
     looked_for = Section("Effects that were tested", tuple(_looked_for(found)))
     if run_by_run:
         yield Section("Measured and simulated, run by run", tuple(run_by_run))
@@ -324,7 +320,7 @@ def _named(values: Mapping[str, float]) -> str:
 
 def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
     yield catalogue.note("loop.seen-above")
-    level, rows = found.before.kinds["single"].threshold, []
+    level, rows = found.before.threshold("single"), []
     for s in found.scores:
         if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
             spec = next(p.spec for p in params.walk_parameters(BY_NAME[s.name]()) if p.spec.amplitude)
