@@ -16,7 +16,7 @@ from worlds import settled, tables
 from calibration.data.robot_file import load_robot, write_robot
 from calibration.discovery import outliers
 from calibration.discovery.discrepancy import (
-    fit_discrepancy,
+    BaseCurve,
     location_columns,
     refine_window,
     similar_variables,
@@ -49,7 +49,8 @@ def found(request):
     bare = space.problem(base.active)
     seen = diagnose_fit(bare, jnp.asarray(base.z), space.library.scored, outliers.bases_at_fit(runs, fitted))
     linear = jax.device_get(seen[0])
-    what = fit_discrepancy(space, base, linear, *CASES[request.param])
+    beside = BaseCurve(space, base, SimpleNamespace(linear=linear), ())
+    vars(beside)["where"] = DiscrepancyLocation(*CASES[request.param], (), (), 0.0, 0.0)  # in place of a search
     truth, sound = settled.readings(case.conditions, case.constants, case.terms)
     s, _ = settled.solve(case.conditions, case.constants, case.terms)
     term = case.terms[0].of(s)
@@ -59,7 +60,10 @@ def found(request):
         space=space,
         base=base,
         linear=linear,
-        what=what,
+        beside=beside,
+        what=beside.fitted,
+        balance=beside.where.place,
+        variable=beside.where.variable,
         truth=truth[:, sound].T,
         term=term[sound],
     )
@@ -73,7 +77,7 @@ def sigmas(found, reading):
 
 def at_rows(found, values):
     """What is known on the grid, at the rows of the table."""
-    x = np.asarray(getattr(found.linear.signals, found.what.variable))[: len(found.runs)]
+    x = np.asarray(getattr(found.linear.signals, found.variable))[: len(found.runs)]
     return np.interp(x, found.what.grid, values)
 
 
@@ -117,14 +121,14 @@ def readings_of(robot, runs):
 
 def test_defect_of_each_row_shows_the_discrepancy(found):
     """Its rows scatter about the truth, less what the free parameters absorb of it, by their sds."""
-    (value, sd), rows = balance_error_by_row(found.linear, found.what.balance), len(found.runs)
-    change = np.array(found.linear.defects)[PROBED.index(found.what.balance)]
+    (value, sd), rows = balance_error_by_row(found.linear, found.balance), len(found.runs)
+    change = np.array(found.linear.defects)[PROBED.index(found.balance)]
     change[:rows] *= found.term[:, None]
     change[rows:] = 0
     residual = np.zeros_like(found.linear.residual)
     residual[: change.size] = -change.ravel()
     clean = eqx.tree_at(lambda linear: linear.residual, found.linear, residual)
-    expected = balance_error_by_row(clean, found.what.balance)[0][:rows]
+    expected = balance_error_by_row(clean, found.balance)[0][:rows]
     pull = (value[:rows] - expected) / sd[:rows]
     assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
     assert np.corrcoef(expected, value[:rows])[0, 1] > 0.5
@@ -132,20 +136,20 @@ def test_defect_of_each_row_shows_the_discrepancy(found):
 
 def test_formula_finds_the_variable(found):
     """One term where a term explains the curve. No term does for a step of the voltage, which words describe."""
-    what, proposal = found.what, found.what.proposal
-    if what.balance == "electrical":
+    what, proposal = found.what, found.beside.proposal
+    if found.balance == "electrical":
         seen = SimpleNamespace(
-            window=None, variable=what.variable, at=what.grid, value=what.curve, unit="V", proposal=proposal
+            window=None, variable=found.variable, at=what.grid, value=what.curve, unit="V", proposal=proposal
         )
         assert not proposal.terms and loop_words.proposed_formula(seen).startswith("The curve rises from ")
         return
-    assert what.variable in proposal.variables
+    assert found.variable in proposal.variables
     assert len(proposal.terms) == 1 and proposal.mark == "a proposal, not a finding"
-    curve = fit_smooth_curve(found.linear, what.balance, what.variable, found.space.included)
+    curve = fit_smooth_curve(found.linear, found.balance, found.variable, found.space.included)
     assert proposal.explained >= MOST * curve.explained > 100
     assert all(abs(c) > 3 * s for c, s in zip(proposal.coefficients, proposal.sds, strict=True))
-    assert proposal.expression.startswith(SYMBOL[what.balance] + " = ")
-    assert proposal.expression.count(f" {what.unit} (") == len(proposal.terms)
+    assert proposal.expression.startswith(SYMBOL[found.balance] + " = ")
+    assert proposal.expression.count(f" {found.beside.unit} (") == len(proposal.terms)
 
 
 @pytest.mark.slow
@@ -196,10 +200,10 @@ def test_every_place_of_a_curve_has_a_symbol():
 
 def test_no_formula_is_proposed_where_nothing_shows(found):
     blind = eqx.tree_at(lambda linear: linear.defects, found.linear, 0 * np.asarray(found.linear.defects))
-    curve = fit_smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
-    proposal = propose_formula(blind, found.what.balance, found.space.included, curve)
+    curve = fit_smooth_curve(found.linear, found.balance, found.variable, found.space.included)
+    proposal = propose_formula(blind, found.balance, found.space.included, curve)
     assert proposal.expression == "" and proposal.terms == ()
-    assert np.isnan(balance_error_by_row(blind, found.what.balance)[0]).all()
+    assert np.isnan(balance_error_by_row(blind, found.balance)[0]).all()
 
 
 def test_variables_over_which_a_curve_is_as_improbable_are_told():

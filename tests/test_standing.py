@@ -228,8 +228,8 @@ def test_the_curve_of_a_log_is_that_of_bayesian_least_squares_at_its_base(toy, m
     space = SimpleNamespace(included=toy.counts, bare=SimpleNamespace(base=SimpleNamespace(rig=rig)))
     beside = BaseCurve(space, None, SimpleNamespace(linear=toy.linear), ())
     vars(beside)["where"] = where  # in place of a search
-    found = findings.unnamed_discrepancy_of_log(beside, where, 0.01)
-    curve, unit, _ = beside.linear_curve
+    found = findings.unnamed_discrepancy(beside, where, 0.01, 0, True)
+    curve, unit = beside.at_base, beside.unit
     raw = bases.place_signature(toy.linear, "track", curve.basis(toy.linear.variable("speed_motor")))
     design = np.hstack([toy.slopes, curve.scale * raw @ curve.root])
     covariance = np.linalg.inv(np.eye(design.shape[1]) + design.T @ design)
@@ -237,12 +237,8 @@ def test_the_curve_of_a_log_is_that_of_bayesian_least_squares_at_its_base(toy, m
     assert_allclose(found.value, -shape @ (covariance @ design.T @ toy.readings)[4:], rtol=1e-6)
     assert_allclose(found.sd, np.sqrt(np.diag(shape @ covariance[4:, 4:] @ shape.T)), rtol=1e-6)
     assert (found.unit, found.family, found.over) == (unit, where.family, None)
-    assert (
-        findings.unnamed_discrepancy_of_log(
-            beside, dataclasses.replace(where, variable=next(iter(bases.ORDERS))), 0.01
-        )
-        is None
-    )
+    wave = dataclasses.replace(where, variable=next(iter(bases.ORDERS)))
+    assert findings.unnamed_discrepancy(beside, wave, 0.01, 0, True) is None
 
 
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):

@@ -55,7 +55,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
     if is_added:
         last = prediction.FittedProblem(*space.fit_of(best.active, best.z))
     elif beside is not None:  # no effect is added, but a curve
-        curve, after = beside.curve, beside.diagnosis
+        curve, after = beside.fitted, beside.diagnosis
         z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
         last, known_last, decided_cost = prediction.FittedProblem(curve.problem, z, None), None, cost
     given.progress(fit_notes.progress_remark("errors"))
@@ -83,10 +83,9 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         ask = kind.menu and not observe.long
         concealed = hidden.find_hidden_effects(table, best, alike, left, traced.ends, settings, ask=ask)
     unnamed = None
-    if beside is not None and where is not None:
-        unnamed = findings.unnamed_discrepancy(beside, where, left.test.p_value, len(runs))
-    elif nameless and traced.beside is not None and where is not None:
-        unnamed = findings.unnamed_discrepancy_of_log(traced.beside, where, left.test.p_value)
+    if nameless and traced.beside is not None and where is not None:
+        p_value, simulated = left.test.p_value, run is not None
+        unnamed = findings.unnamed_discrepancy(traced.beside, where, p_value, len(runs), simulated)
     ladder = () if traced.searched is None else (alike or traced.searched).ladder
     near, too_large = findings.listed_alternatives(table, traced.best, decided_cost, ladder, settings)
     scores, both_ways = findings.effect_scores(table, left.scores, settings), goes_both_ways(runs)
@@ -216,7 +215,7 @@ def _next_experiment(
 
 
 def posterior_of_curve(
-    space: active_set.CandidateSpace, active: Names, curve: discrepancy.Discrepancy
+    space: active_set.CandidateSpace, active: Names, curve: discrepancy.FittedCurve
 ) -> posterior_file.Posterior:
     """Posterior distribution of a fit with a smooth curve. The ordinates are linear in their coordinates and come
     last.

@@ -208,12 +208,11 @@ def _base_and_ordinates(shaped: CurveCoordinates, z: Array) -> tuple[Array, tupl
 
 
 @dataclasses.dataclass(frozen=True)
-class Discrepancy:
-    """A located discrepancy, described by a smooth curve that is fitted together with the base.
+class FittedCurve:
+    """A smooth curve that is fitted together with the base.
 
     Attributes:
-        balance, variable, unit: place and variable of the discrepancy, and the unit of the balance.
-        effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
+        robot: fitted robot with the curve.
         grid: values of the variable for the curve [SI].
         curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty of the
             base, so it is wide if base parameters can replace the curve.
@@ -222,13 +221,8 @@ class Discrepancy:
         problem: problem of the fit with the curve.
         reading: simulated reading of each row [SI], shape (rows, channels).
         converged: True if the fit is an optimum.
-        proposal: a formula for the curve.
     """
 
-    balance: str
-    variable: str
-    unit: str
-    effect: str
     robot: Robot
     grid: np.ndarray
     curve: np.ndarray
@@ -239,42 +233,41 @@ class Discrepancy:
     problem: Problem
     reading: np.ndarray
     converged: bool
-    proposal: Proposal
 
 
-def fit_discrepancy(
-    space: CandidateSpace, base: Candidate, linear: Linearization, balance: str, variable: str
-) -> Discrepancy:
-    """Fits a smooth curve over a variable in a balance together with the base, and proposes a formula for it.
+def fit_curve(space: CandidateSpace, base: Candidate, at_base: SmoothCurve) -> FittedCurve:
+    """Fits a smooth curve together with the base.
 
     Args:
         base: fit without the curve.
-        linear: linearization of that fit.
-        balance: one of `bases.BALANCES`, or a channel.
-        variable: one of `bases.VARIABLES`, or a window.
+        at_base: the curve to first order at that fit.
     """
-    included = space.included
-    at_base = fit_smooth_curve(linear, balance, variable, included)
-    problem = _problem_with_curve(space, base, at_base)
-    inner = len(problem.coordinates.base)
-    starts = np.zeros((STARTS, len(problem.coordinates)))
+    # A curve of this name from an earlier round is replaced, because its parameters have the same names.
+    bare = space.problem(base.active) if base.effects else space.bare
+    other_effects = tuple(e for e in bare.base.effects if e.name != at_base.effect)
+    values = {"amplitude": at_base.scale, "low": at_base.low, "high": at_base.high}
+    added = params.replace(UNNAMED[at_base.effect](), {n: jnp.asarray(v) for n, v in values.items()})
+    names = tuple(f"effects.{at_base.effect}.{n}" for n in ORDINATES)
+    shaped = CurveCoordinates(bare.coordinates, jnp.asarray(at_base.root), names)
+    problem = dataclasses.replace(
+        bare,
+        base=dataclasses.replace(bare.base, effects=(*other_effects, added)),
+        coordinates=shaped,
+        data=dataclasses.replace(bare.data, centre=jnp.zeros(len(shaped))),
+    )
+    inner = len(bare.coordinates)
+    starts = np.zeros((STARTS, len(shaped)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
     optima, observations = fit_from_each_start(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
-    z = np.asarray(optima.z[k])
-    covariance = np.asarray(optima.covariance[k])
-    grid, values, sd = at_base.drawn(z[inner:], covariance[inner:, inner:])
+    z, covariance = np.asarray(optima.z[k]), np.asarray(optima.covariance[k])
+    grid, curve, sd = at_base.drawn(z[inner:], covariance[inner:, inner:])
     robot = problem.robot(jnp.asarray(z))  # also has the absent effects of the slots
-    names = {e.name for e in space.bare.base.effects} | set(base.effects) | {at_base.effect}
-    return Discrepancy(
-        balance=balance,
-        variable=variable,
-        unit=PLACES[balance][0],
-        effect=at_base.effect,
-        robot=with_only(robot, names),
+    return FittedCurve(
+        robot=with_only(robot, {*(e.name for e in space.bare.base.effects), *base.effects, at_base.effect}),
         grid=grid,
-        curve=values,
+        curve=curve,
         sd=sd,
         chi2=(2 * base.cost, 2 * float(optima.cost[k])),
         z=z,
@@ -282,26 +275,17 @@ def fit_discrepancy(
         problem=problem,
         reading=np.asarray(observations.reading[k]),
         converged=bool(optima.converged[k]),
-        proposal=propose_formula(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
     )
-
-
-def diagnose_with_curve(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
-    """Diagnosis of the fit with a curve. Its critical values are those of the base (`left`)."""
-    z, effects = jnp.asarray(found.z), space.library.scored
-    linear, scores, strongest = diagnose_fit(found.problem, z, effects, bases)
-    return Diagnosis(linear, scores, left.test.of(strongest))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BaseCurve:
-    """Smooth curve of the discrepancy of the base, and its diagnosis. Each is computed when it is first needed, and
-    once.
+    """Smooth curve of the discrepancy of the base. Each of its results is computed when it is first needed, and once.
 
     Both the verdict and its result may need them.
 
     Attributes:
-        space, base, left, bases: arguments of `fit_discrepancy` and `diagnose_with_curve`.
+        space, base, left, bases: the fit of the base, its diagnosis, and the bases of smooth curves there.
     """
 
     space: CandidateSpace
@@ -319,38 +303,30 @@ class BaseCurve:
         """Location of the discrepancy, from `locate_discrepancy`."""
         return locate_discrepancy(self.left, self.bases, self.space.included)
 
-    @functools.cached_property
-    def curve(self) -> Discrepancy:
-        """The curve, fitted together with the base."""
-        return fit_discrepancy(self.space, self.base, self.left.linear, self.where.place, self.where.variable)
+    @property
+    def unit(self) -> str:
+        """Unit of the balance of the discrepancy."""
+        return PLACES[self.where.place][0]
 
     @functools.cached_property
-    def linear_curve(self) -> tuple[SmoothCurve, str, Proposal]:
-        """The curve to first order at the base fit, the unit of its balance, and a formula for it."""
-        linear, location, included = self.left.linear, self.where, self.space.included
-        curve = fit_smooth_curve(linear, location.place, location.variable, included)
+    def at_base(self) -> SmoothCurve:
+        """The curve to first order at the base fit."""
+        return fit_smooth_curve(self.left.linear, self.where.place, self.where.variable, self.space.included)
+
+    @functools.cached_property
+    def proposal(self) -> Proposal:
+        """A formula for the curve."""
         voltage = self.space.bare.base.rig.shows_voltage
-        return (
-            curve,
-            PLACES[location.place][0],
-            propose_formula(linear, location.place, included, curve, voltage=voltage),
-        )
+        return propose_formula(self.left.linear, self.where.place, self.space.included, self.at_base, voltage=voltage)
+
+    @functools.cached_property
+    def fitted(self) -> FittedCurve:
+        """The curve, fitted together with the base."""
+        return fit_curve(self.space, self.base, self.at_base)
 
     @functools.cached_property
     def diagnosis(self) -> Diagnosis:
-        """Diagnosis of the fit with the curve."""
-        return diagnose_with_curve(self.space, self.curve, self.bases, self.left)
-
-
-def _problem_with_curve(space: CandidateSpace, base: Candidate, curve: SmoothCurve) -> Problem:
-    """Problem of the base and a smooth curve, whose ordinates are the last coordinates."""
-    problem = space.problem(base.active) if base.effects else space.bare
-    # A curve of this name from an earlier round is replaced, because its parameters have the same names.
-    other_effects = tuple(e for e in problem.base.effects if e.name != curve.effect)
-    values = {"amplitude": curve.scale, "low": curve.low, "high": curve.high}
-    added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in values.items()})
-    robot = dataclasses.replace(problem.base, effects=(*other_effects, added))
-    names = tuple(f"effects.{curve.effect}.{n}" for n in ORDINATES)
-    shaped = CurveCoordinates(problem.coordinates, jnp.asarray(curve.root), names)
-    data = dataclasses.replace(problem.data, centre=jnp.zeros(len(shaped)))
-    return dataclasses.replace(problem, base=robot, coordinates=shaped, data=data)
+        """Diagnosis of the fit with the curve. Its critical values are those of the base."""
+        problem, z = self.fitted.problem, jnp.asarray(self.fitted.z)
+        linear, scores, strongest = diagnose_fit(problem, z, self.space.library.scored, self.bases)
+        return Diagnosis(linear, scores, self.left.test.of(strongest))

@@ -217,41 +217,30 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
 
 def unnamed_discrepancy(
-    beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int
-) -> UnnamedDiscrepancy:
-    """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit."""
-    curve, linear, lacks = beside.curve, beside.diagnosis.linear, {}
-    happens = bases.window_from_name(where.variable)
-    x, way = linear.curve_variable(curve.balance, where.variable if happens is None else happens.axis)
-    if beside.space.bare.observe.rows_tell:
-        remains, sd = projection.balance_error_by_row(linear, curve.balance)
-        defect = np.interp(x, curve.grid, curve.curve) + way * remains
-        lacks = {"over": x[:rows], "defect": defect[:rows], "defect_sd": sd[:rows]}
-    return UnnamedDiscrepancy(
-        **dataclasses.asdict(where),
-        unit=curve.unit,
-        effect=curve.effect,
-        p_value=p_value,
-        score=float(curve.chi2[0] - curve.chi2[1]),
-        at=curve.grid,
-        value=curve.curve,
-        sd=curve.sd,
-        proposal=curve.proposal,
-        **lacks,
-    )
-
-
-def unnamed_discrepancy_of_log(
-    beside: BaseCurve, where: DiscrepancyLocation, p_value: float
+    beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int, simulated: bool
 ) -> UnnamedDiscrepancy | None:
-    """The same for a log, to first order at its base fit. None for a wave, which has its own phase in each run."""
-    if where.variable in bases.ORDERS:
+    """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit.
+
+    A simulated log has the curve to first order at the base fit of its equations. None for a wave there, which has
+    its own phase in each run.
+    """
+    curve, lacks = beside.at_base, {}
+    if not simulated:
+        fitted, linear = beside.fitted, beside.diagnosis.linear
+        at, value, sd, score = fitted.grid, fitted.curve, fitted.sd, fitted.chi2[0] - fitted.chi2[1]
+        if beside.space.bare.observe.rows_tell:
+            happens = bases.window_from_name(where.variable)
+            x, way = linear.curve_variable(where.place, where.variable if happens is None else happens.axis)
+            remains, row_sd = projection.balance_error_by_row(linear, where.place)
+            defect = np.interp(x, at, value) + way * remains
+            lacks = {"over": x[:rows], "defect": defect[:rows], "defect_sd": row_sd[:rows]}
+    elif where.variable in bases.ORDERS:
         return None
-    curve, unit, proposal = beside.linear_curve
-    points, value, sd = curve.drawn(curve.start, curve.covariance)
+    else:
+        (at, value, sd), score = curve.drawn(curve.start, curve.covariance), curve.explained
     return UnnamedDiscrepancy(
-        **dataclasses.asdict(where), unit=unit, effect=curve.effect, p_value=p_value, score=curve.explained,
-        at=points, value=value, sd=sd, proposal=proposal,
+        **dataclasses.asdict(where), unit=beside.unit, effect=curve.effect, p_value=p_value, score=float(score),
+        at=at, value=value, sd=sd, proposal=beside.proposal, **lacks,
     )  # fmt: skip
 
 

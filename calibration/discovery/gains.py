@@ -82,7 +82,7 @@ def hold_out_gain_of_curve(beside: BaseCurve, runs: Runs, predicted: Predicted) 
 
     Only rows within the range of the curve's variable in each fit count, because a curve does not extrapolate.
     """
-    space, base, curve = beside.space, beside.base, beside.curve
+    space, base, curve = beside.space, beside.base, beside.fitted
     kinds = blocks_room.predictable_blocks(runs, space.bare)
     predictions = prediction.FittedProblem(curve.problem, curve.z, None).held_out(kinds)
     changed = _changed_readings(space, runs, simulated_reading(space, base), curve.reading)

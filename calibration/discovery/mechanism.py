@@ -101,7 +101,7 @@ def _rank_families(beside: BaseCurve, pairs: dict[str, Fits]) -> tuple[dict[str,
     if beside.space.bare.observe.over_time:  # fits of curves take long, and windows have none
         by_curve = beside.where.explained - OF_CURVE
     else:
-        by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
+        by_curve = beside.fitted.chi2[0] - beside.fitted.chi2[1] - OF_CURVE
     explained = {family: _explained(pair) for family, pair in pairs.items()}
     explained[families[0]] = max(by_curve, explained.get(families[0], 0.0))
     most = max(explained.values())

@@ -211,7 +211,7 @@ def _compare_with_single_curve(beside: BaseCurve, best: Candidate) -> NameSuppor
     if not space.bare.observe.over_time and equation_of_place(location.place) in equations:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
-        adequate = not left.test.exceeds_margin("chi2", beside.curve.chi2[1])
+        adequate = not left.test.exceeds_margin("chi2", beside.fitted.chi2[1])
         if adequate and not beside.diagnosis.test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(PlacedCurve(location.place, (location.variable,)),))
     return NameSupport(True)
