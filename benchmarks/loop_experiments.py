@@ -62,7 +62,7 @@ def supported(seen: experiments.PredictedReadings, carried_out: Mapping[str, Map
     at, value, sd = at[read], value[read], sd[read]
     chi2 = {}
     for k, name in enumerate(seen.names):
-        d = value - seen.value[k, at]
-        chi2[name] = float(d @ np.linalg.solve(experiments._covariance(seen.half[k, at], sd), d))
+        d, half = value - seen.value[k, at], seen.half[k, at]
+        chi2[name] = float(d @ np.linalg.solve(half @ half.T + np.diag(sd**2), d))
     best = min(chi2, key=chi2.__getitem__)
     return Verdict(chi2, best, tuple(n for n, c in chi2.items() if c - chi2[best] >= seen.settings.refuted))

@@ -8,7 +8,7 @@ import pytest
 from synthetic import FEW, SETTLED, small, table
 from worlds import laws, settled, tables
 
-from calibration.discovery import findings, verdict
+from calibration.discovery import verdict
 from calibration.discovery.classes import find_prior_shifts, prior_shift_scores
 from calibration.discovery.loop_notes import AlternativeValue
 from calibration.words import loop_words as words
@@ -97,17 +97,16 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     found = {s.name: s for s in find_prior_shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings)}
     assert "motor.resistance" in found
     shift = found["motor.resistance"]
-    said = findings._stated_value(fitted.space, fitted.candidate, shift)
-    sd = shift.fit.sd[shift.index] * NOMINAL * 0.1
-    assert abs(said.value - truth) < 0.05 * truth and sd < 0.05 * truth
-    assert said.stated == pytest.approx(NOMINAL) and said.unit == "ohm" and said.prior_sds > 5
+    sd = shift.fit.sd[fitted.space.coordinates.base.names.index(shift.name)] * NOMINAL * 0.1
+    assert abs(shift.value - truth) < 0.05 * truth and sd < 0.05 * truth
+    assert shift.stated == pytest.approx(NOMINAL) and shift.unit == "ohm" and shift.prior_sds > 5
     # freed of its prior it explains more than held by it, and the fit is as good as noise allows
-    assert said.rise_chi2 < -NEEDED
+    assert 2 * (shift.fit.cost - fitted.candidate.cost) < -NEEDED
     readings = 3 * len(runs)
     assert 2 * shift.fit.cost < readings + 4 * np.sqrt(2 * readings)
-    freed = AlternativeValue("motor.resistance", said.value, said.unit)
-    assert words.freed_value(freed) == f"motor.resistance is {said.value:.3g} ohm"
-    assert words.freed_value(freed._replace(unit="-")) == f"motor.resistance is {said.value:.3g}"
+    freed = AlternativeValue("motor.resistance", shift.value, shift.unit)
+    assert words.freed_value(freed) == f"motor.resistance is {shift.value:.3g} ohm"
+    assert words.freed_value(freed._replace(unit="-")) == f"motor.resistance is {shift.value:.3g}"
 
 
 def test_nothing_is_shifted_where_the_sheet_is_right(looks):

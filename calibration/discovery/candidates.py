@@ -59,14 +59,9 @@ def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: n
         return tuple(negative)
     power = _dissipated_power(space.bare.observe, space.problem(active).robot(jnp.asarray(z)))
     by_balance = {} if power is None else dict(zip(SINK, np.asarray(power)[:, space.included], strict=True))
-    return tuple(n for n in negative if not _dissipates(by_balance.get(space.library[n].balance)))
-
-
-def _dissipates(power: np.ndarray | None) -> bool:
-    """True if a balance never supplies power in the rows where its power is known, and if there is such a row."""
-    if power is None or not np.isfinite(power).any():
-        return False
-    return bool(np.nanmin(power) >= -ROUNDING * np.nanmax(np.abs(power)))
+    known_power = {b: x[np.isfinite(x)] for b, x in by_balance.items() if np.isfinite(x).any()}
+    dissipates = {b for b, x in known_power.items() if x.min() >= -ROUNDING * np.abs(x).max()}
+    return tuple(n for n in negative if space.library[n].balance not in dissipates)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -140,13 +135,8 @@ class Candidate:
         return (*self.active[:k], effect, *self.active[k + 1 :])
 
 
-def empty_slots(settings: Settings) -> Names:
-    """Slots without effects."""
-    return ("",) * settings.slots
-
-
 def fill_slots(effects: Sequence[str], settings: Settings) -> Names:
-    """Slots with these effects first and empty slots after them."""
+    """Slots with these effects first, and empty slots ("") after them."""
     return (*effects, *("",) * (settings.slots - len(effects)))
 
 
@@ -230,7 +220,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
         unusable_rows = space.bare.observe.unreachable(np.asarray(observations.status[k])) & space.included
         if not unusable_rows.any():
             best = jax.tree.map(lambda x: x[k], optima)  # noqa: B023
-            fit = candidate_of_fit(space, empty_slots(settings), with_slots(best, space, settings), settings)
+            fit = candidate_of_fit(space, fill_slots((), settings), with_slots(best, space, settings), settings)
             return BaseFit(fit, np.asarray(observations.reading[k]), space, unusable)
         unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(unusable_rows))}))
         space = space.without(unusable_rows)
@@ -363,8 +353,13 @@ def residuals_by_channel(
 
 def excess_misfit(space: CandidateSpace, base: Candidate) -> float:
     """χ² of the base fit, including priors, minus its expectation from noise (`Observer.noise_misfit`) [σ²]."""
-    counts = np.asarray(space.weight > 0)
-    return 2 * base.cost - space.bare.observe.noise_misfit(lambda: _whitened_residuals(space, base), counts)
+    counts, data = np.asarray(space.weight > 0), space.equipped.data
+
+    def whitened() -> np.ndarray:  # residuals divided by their sds, 0 for excluded readings
+        off = (simulated_reading(space, base) - np.asarray(data.measured)) / np.asarray(data.sd)
+        return np.where(counts, np.nan_to_num(off), 0.0)
+
+    return 2 * base.cost - space.bare.observe.noise_misfit(whitened, counts)
 
 
 def share_of_excess(excess: float, explained: float) -> float:
@@ -383,10 +378,3 @@ def simulated_reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray
     """Readings of a candidate [SI], shape (rows, channels)."""
     problem, z, active = space.fit_of(candidate.active, candidate.z)
     return np.asarray(problem.observe.observation_at(problem, z, active).reading)
-
-
-def _whitened_residuals(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
-    """Residuals of a candidate divided by their sds, 0 for excluded readings, shape (rows, channels)."""
-    data = space.equipped.data
-    off = (simulated_reading(space, candidate) - np.asarray(data.measured)) / np.asarray(data.sd)
-    return np.where(np.asarray(space.weight) > 0, np.nan_to_num(off), 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -35,12 +34,16 @@ class Shift:
 
     Attributes:
         name: dotted name of the parameter.
-        index: index of its coordinate.
+        value, stated: value that explains the data, and mean of its prior, both in `unit`.
+        prior_sds: their distance in prior sds.
         fit: the fit with the parameter free of its prior. Its cost excludes that prior.
     """
 
     name: str
-    index: int
+    value: float
+    stated: float
+    unit: str
+    prior_sds: float
     fit: Candidate
 
 
@@ -73,13 +76,14 @@ def find_prior_shifts(
     else:
         residual, jacobian = linear.residual, linear.jacobian
     explained, values = prior_shift_scores(np.asarray(jacobian), np.asarray(residual))
-    shifts = []
-    for k in np.argsort(-explained[: space.free]):
+    shifts, base, p = [], space.coordinates.base, space.free
+    for k in np.argsort(-explained[:p]):
         if explained[k] < needed:
             break
         fit = _fit_without_prior(space, at, int(k), float(values[k]), settings)
         if fit is not None:
-            shifts.append(Shift(space.coordinates.base.names[k], int(k), fit))
+            value, stated = (float(base.value(np.asarray(z))[k]) for z in (fit.z[:p], np.zeros(p)))
+            shifts.append(Shift(base.names[k], value, stated, base.units[k], float(fit.z[k]), fit))
     return shifts
 
 
@@ -188,15 +192,10 @@ def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ..
         fit = Projection.of(after.linear)
         column = fit.jacobian[: after.linear.readings, space.free + best.active.index(name), None]
         ammeter = ammeter_families(space, remove_effect(space, best, name, fit), column, family, settings)
-        families.append(tuple(dict.fromkeys((*families_of_members(space, same), *ammeter))))
+        families.append(tuple(dict.fromkeys((*(space.library[m].family() for m in same), *ammeter))))
         shifts = find_prior_shifts(space, without, SURE * gain, settings, left.linear if one else None)
         shift_lists.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
     return Classes(tuple(members), tuple(shift_lists), tuple(families), (*ladder, *fitted))
-
-
-def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:
-    """Families of the effects of a class, without repeats. The family of the leading effect is first."""
-    return tuple(dict.fromkeys(space.library[m].family() for m in members))
 
 
 def remove_effect(space: CandidateSpace, best: Candidate, effect: str, fit: Projection) -> Projection:

@@ -79,12 +79,9 @@ class PredictedReadings:
         spans = predicted.reading_spans(self.experiments)
         columns = np.concatenate([np.flatnonzero(self.exists[spans[e]]) + spans[e].start for e in experiments])
         d = self.value[a, columns] - self.value[b, columns]
-        squares = [d @ np.linalg.solve(_covariance(self.half[x, columns], self.sd[columns]), d) for x in (a, b)]
+        halves = (self.half[x, columns] for x in (a, b))
+        squares = [d @ np.linalg.solve(half @ half.T + np.diag(self.sd[columns] ** 2), d) for half in halves]
         return float(np.sqrt(max(min(squares), 0.0)))
-
-
-def _covariance(half: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    return half @ half.T + np.diag(sd**2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,11 +169,9 @@ class Proposal:
 # --- alternatives -----------------------------------------------------------------------------------
 
 
-def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
-    """Candidates that the data cannot separate, by the names of their effects. The best fit is first.
-
-    Args:
-        stated: True to include stated values that may be wrong in place of an effect. Their key is the value's name.
+def alternatives_of_class(best: Candidate, found: Classes) -> dict[str, Candidate]:
+    """Candidates that the data cannot separate, by the names of their effects, and of stated values that may be wrong
+    in place of one. The best fit is first.
     """
     fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
     alternatives = {best.active: best}
@@ -185,9 +180,8 @@ def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = Tru
             active = best.with_effect(leader, name)
             alternatives[active] = fitted[frozenset(active) - {""}]
     by_name = {" + ".join(c.effects): c for c in alternatives.values()}
-    if stated:
-        for shifts in found.stated:
-            by_name |= {" + ".join((s.name, *s.fit.effects)): s.fit for s in shifts}
+    for shifts in found.stated:
+        by_name |= {" + ".join((s.name, *s.fit.effects)): s.fit for s in shifts}
     return by_name
 
 

@@ -125,7 +125,15 @@ def found_effects(
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
     others = [base] if len(best.effects) == 1 else search.refit_without_each(space, best, settings, found.ladder)
     null, excess = np.asarray(test.null.single), candidates.excess_misfit(space, base)
-    effects = []
+    effects, fits = [], {c.key: c for c in reversed((best, *found.ladder))}
+
+    def class_member(leader: str, name: str) -> ClassMember:
+        other = fits[frozenset(best.with_effect(leader, name)) - {""}]
+        k, unit = other.active.index(name), amplitude_unit(space.library[name])
+        return ClassMember(
+            float(other.amplitude[k] * unit), float(other.size[k]), float(2 * (other.cost - best.cost))
+        )
+
     classes_of_effects = zip(found.members, found.stated, found.families, others, strict=True)
     for slot, (members, shifts, families, without) in enumerate(classes_of_effects):
         effect, gain = space.library[members[0]], float(2 * (without.cost - best.cost))
@@ -133,8 +141,11 @@ def found_effects(
         effects.append(
             FoundEffect(
                 name=effect.name,
-                members={name: _class_member(space, best, found, members[0], name) for name in members},
-                stated={s.name: _stated_value(space, best, s) for s in shifts},
+                members={name: class_member(members[0], name) for name in members},
+                stated={
+                    s.name: StatedValue(s.value, s.stated, s.unit, s.prior_sds, float(2 * (s.fit.cost - best.cost)))
+                    for s in shifts
+                },
                 families=families,
                 balance=effect.balance,
                 unit=BALANCES[effect.balance][0],
@@ -167,24 +178,6 @@ def _effect_parameters(
 
 
 _shaped = jax.jit(jax.value_and_grad(linearization.shape_parameter_at, argnums=1))
-
-
-def _class_member(
-    space: CandidateSpace, best: Candidate, found: classes.Classes, leader: str, name: str
-) -> ClassMember:
-    """Result entry of an alternative effect of a class."""
-    key = frozenset(best.with_effect(leader, name)) - {""}
-    other = next(c for c in (best, *found.ladder) if c.key == key)
-    position = other.active.index(name)
-    amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
-    return ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
-
-
-def _stated_value(space: CandidateSpace, best: Candidate, shift: classes.Shift) -> StatedValue:
-    coordinates, p, k = space.coordinates.base, space.free, shift.index
-    value = [float(coordinates.value(np.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
-    rise = float(2 * (shift.fit.cost - best.cost))
-    return StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -336,12 +336,6 @@ def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
     return _in_widest_gaps([0.55 * used[0], *used] if len(used) == 1 else used, ends, 4)
 
 
-def other_torques(used: Sequence[float]) -> tuple[float, ...]:
-    """Brake torques that the table lacks, in the widest gaps above zero, and the largest one that it used."""
-    most = max(used, default=0.0)
-    return _in_widest_gaps([0.0, *used], [floor_significant(most)], 4) if most > 0 else (0.0,)
-
-
 def _travel_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
     """Runs of the robot with one configuration."""
 
@@ -414,15 +408,17 @@ def _shaft_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
     top = round_significant(1.3 * high) if 1.3 * high < allowed else floor_significant(max(allowed, high))
     between = 0.5 * (sizes[0] + high) if top > high else 0.5 * (low + high)
     others = tuple(sorted({round_significant(low), round_significant(between), top}))
-    torques = other_torques(reach.torques)
     way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
     ends = [way * x for x in (sizes[0], sizes[-1])]
     runs = functools.partial(_combined_runs, reach, used=used)
     experiments = [runs(others_of[reach.imposed], "run", kinds=("other voltages",), voltages=others)]
+    # torques that the table lacks, in the widest gaps above zero, and the largest one that it used
+    most = max(reach.torques, default=0.0)
+    torques = _in_widest_gaps([0.0, *reach.torques], [floor_significant(most)], 4) if most > 0 else (0.0,)
     if not min(levels) < 0 < max(levels):
         backward = [0.0, *(way * x for x in torques[1:2])]
         experiments.append(runs("reverse", "other way", voltages=ends, torques=backward))
-    if max(reach.torques, default=0.0) > 0:
+    if most > 0:
         forward = [-x for x in ends]
         experiments.append(runs("other torques", "run", voltages=forward, torques=[-way * x for x in torques]))
     return tuple(experiments)

@@ -18,7 +18,7 @@ from calibration.data import Columns
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.candidates import BaseFit, Candidate, empty_slots, fit_base
+from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base
 from calibration.discovery.experiments import predict_menu
 from calibration.discovery.score_tests import (
     Diagnosed,
@@ -170,7 +170,7 @@ def compile_ahead(space: CandidateSpace, runs: Runs, settings: Settings) -> Iter
     at the prior mean. It yields a function of the base fit that does the same for the predictions of experiments. All
     results are discarded.
     """
-    nothing, none = np.zeros(len(space.coordinates)), empty_slots(settings)
+    nothing, none = np.zeros(len(space.coordinates)), fill_slots((), settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
 
@@ -270,7 +270,7 @@ def _isolated_rows(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int
 
 def _diagnose_base(base: BaseFit, runs: Runs, settings: Settings) -> tuple[Bases, Diagnosed]:
     space, bases = base.space, bases_at_fit(runs, base)
-    problem, z = space.problem(empty_slots(settings)), base.candidate.z
+    problem, z = space.problem(fill_slots((), settings)), base.candidate.z
     if problem.observe.long:  # by the program of its fit
         problem, z = space.bare, z[: space.free]
     return bases, jax.device_get(diagnose_fit(problem, jnp.asarray(z), space.library.scored, bases))

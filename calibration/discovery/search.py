@@ -20,7 +20,6 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import (
     Candidate,
     candidate_of_fit,
-    empty_slots,
     fill_slots,
     fit_candidates,
     fit_in_addition,
@@ -86,7 +85,7 @@ def search_effects(
         base: fit without effects.
         left: diagnosis of that fit.
     """
-    names = _names_by_score(space, left.scores)[: _batch_size(space)]
+    names = _names_by_score(space, left.scores)[: space.bare.observe.policy.batch]
     ladder = fit_in_addition(space, [(fill_slots([name], settings), base, left.scores) for name in names], settings)
     null = np.asarray(left.test.null.single)
     best, diagnosis, diagnosed = _best_plausible(ladder), None, None
@@ -159,10 +158,6 @@ def _names_by_score(space: CandidateSpace, scores: ScoreTable, last: Sequence[st
     return [space.library.names[k] for k in np.argsort(-strength)]
 
 
-def _batch_size(space: CandidateSpace) -> int:
-    return space.bare.observe.policy.batch
-
-
 def _extend_set(
     space: CandidateSpace,
     best: Candidate,
@@ -172,13 +167,14 @@ def _extend_set(
     settings: Settings,
 ) -> list[Candidate]:
     """Fits the best set with one more effect and, if the best is the base, also pairs of effects."""
-    names = _names_by_score(space, left_by_best.scores, best.effects)[: _batch_size(space)]
+    batch = space.bare.observe.policy.batch
+    names = _names_by_score(space, left_by_best.scores, best.effects)[:batch]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
         pair_scores = np.triu(left.scores.pair)
         strongest = np.unravel_index(np.argsort(-pair_scores, axis=None)[:PAIRS], pair_scores.shape)
         pairs = dict.fromkeys(tuple(sorted(pair)) for pair in space.library.of[np.stack(strongest, 1)].tolist())
-        for i, j in itertools.islice((pair for pair in pairs if pair[0] != pair[1]), _batch_size(space)):
+        for i, j in itertools.islice((pair for pair in pairs if pair[0] != pair[1]), batch):
             pair = space.library.names[i], space.library.names[j]
             if not {fill_slots(pair, settings), fill_slots(pair[::-1], settings)} & sources.keys():
                 sources[fill_slots(pair, settings)] = base, left
@@ -245,6 +241,6 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormSc
     cost = np.asarray(0.5 * np.sum(equations.residual**2))
     of_fit: tuple[Any, ...] = (equations.z, sd, np.zeros((0, 0)), cost, np.zeros(()), np.asarray(True), np.asarray(0))
     optimum = with_slots(Optimum(*of_fit), space, settings)
-    base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), optimum, settings), simulated=False)
+    base = dataclasses.replace(candidate_of_fit(space, fill_slots((), settings), optimum, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     return WeakFormScreening(base, slides, scores, len(equations.signatures), null)

@@ -137,11 +137,22 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
     base = traced.screened.base.candidate
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
     many = aside > MANY * (aside + counting)
+    classes = () if alike is None else zip(alike.members, alike.stated, alike.families, strict=True)
+    missing = (
+        loop_notes.MissingEffect(
+            names,
+            tuple(loop_notes.AlternativeValue(s.name, s.value, s.unit) for s in shifts),
+            families,
+            support is None or support.established(names[0]),
+            None if support is None else support.test_of(names[0]),
+        )
+        for names, shifts, families in classes
+    )
     return VerdictSummary(
         traced.verdict,
         traced.left.test.p_value,
         traced.where,
-        missing=() if alike is None else missing_effects(space, alike, support),
+        missing=tuple(missing),
         nearest=best.effects if traced.verdict in WITHOUT_NAME and best is not None else (),
         support=support,
         aside=aside if many else 0,
@@ -152,28 +163,6 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
         missed=traced.missed,
         unused=traced.unused,
         far=tuple(n for n, z in zip(space.coordinates.base.names, base.z[: space.free], strict=True) if abs(z) > FAR),
-    )
-
-
-def missing_effects(
-    space: CandidateSpace, alike: Classes, support: loop_notes.NameSupport | None
-) -> tuple[loop_notes.MissingEffect, ...]:
-    """Effects that the search added to the model, each with its alternatives and whether it is established."""
-    c, p = space.coordinates.base, space.free
-    return tuple(
-        loop_notes.MissingEffect(
-            names,
-            tuple(
-                loop_notes.AlternativeValue(
-                    s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index]
-                )
-                for s in shifts
-            ),
-            families,
-            support is None or support.established(names[0]),
-            None if support is None else support.test_of(names[0]),
-        )
-        for names, shifts, families in zip(alike.members, alike.stated, alike.families, strict=True)
     )
 
 
@@ -227,7 +216,13 @@ def remaining_errors(
         missed: channels from `missed_channels`.
         refit, found: hold-out predictions without and with the effects.
     """
-    before, after = _hold_out_error_shares(space, runs, refit, found)
+    measured, counts = runs.measured(), space.weight[: len(runs)] > 0
+    off = [[np.where(counts, x - measured, np.nan) for x in score.reading.values()] for score in (refit, found)]
+    errors: np.ndarray = np.array(off).reshape(2, -1, measured.shape[1])
+    errors = np.where(np.isfinite(errors).all(0), errors, np.nan)  # of readings that both predict
+    with np.errstate(invalid="ignore"):
+        size = np.nansum(np.where(counts, measured, np.nan) ** 2, 0) / counts.sum(0)
+        before, after = np.sqrt(np.nansum(errors**2, 1) / np.isfinite(errors).sum(1) / size)
     index = {c.name: k for k, c in enumerate(runs.channels)}
     remaining = [m._replace(error=float(after[index[m.channel]])) for m in missed]
     described = all(
@@ -235,20 +230,6 @@ def remaining_errors(
         for m in remaining
     )
     return tuple(remaining) if described else ()
-
-
-def _hold_out_error_shares(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> np.ndarray:
-    """Hold-out rms error of each fit, divided by the measured rms of the channel [-]. Only readings that all fits
-    predict count. NaN if there is none. Shape (fits, channels).
-    """
-    measured_values = runs.measured()
-    counts = space.weight[: len(runs)] > 0
-    off = [[np.where(counts, reading - measured_values, np.nan) for reading in s.reading.values()] for s in scores]
-    errors: np.ndarray = np.array(off).reshape(len(scores), -1, measured_values.shape[1])
-    errors = np.where(np.isfinite(errors).all(0), errors, np.nan)
-    with np.errstate(invalid="ignore"):
-        size = np.nansum(np.where(counts, measured_values, np.nan) ** 2, 0) / counts.sum(0)
-        return np.sqrt(np.nansum(errors**2, 1) / np.isfinite(errors).sum(1) / size)
 
 
 def unused_inputs(runs: Runs) -> Names:
