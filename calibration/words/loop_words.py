@@ -33,8 +33,21 @@ if TYPE_CHECKING:
 
 
 def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
-    """A verdict in a sentence or a few."""
-    text = _verdict(said)
+    """A verdict in a sentence or a few: the claim with its evidence, then what qualifies it."""
+    where, evidence = said.where, f"family-wise p {p_value(said.p)}"
+    if said.missed:
+        evidence += f", but it still misses {', '.join(map(_missed, said.missed))} on unseen runs"
+    if said.verdict == "none":
+        text = f"Nothing is missing: the residuals are consistent with noise (family-wise p = {said.p:.2g})."
+    elif said.verdict == "undescribed":
+        text = _undescribed(said)
+    elif said.verdict in WITHOUT_NAME and where is not None:
+        claim = _mechanism_claim if said.verdict == "mechanism" else _place_claim
+        text = f"{claim(said, where, evidence)}{_not_established(said)}"
+    else:
+        names = [_effect_and_rivals(one) for one in said.missing if one.established]
+        text = f"Missing: {' and '.join(names)} ({evidence}).{_tentative(said)}"
+        text += "" if where is None else f" The {bases.place_in_words(where.place)} still has an error."
     if said.aside:
         share = 100 * said.aside / said.of
         text = f"{said.aside} of {said.of} rows ({share:.0f} %) are set aside as outliers. {text}"
@@ -45,39 +58,41 @@ def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
     return text
 
 
-def _verdict(said: loop_notes.VerdictSummary) -> str:
-    location = said.where
-    if said.verdict == "undescribed":
-        return _undescribed(said)
-    if said.verdict == "none":
-        return f"Nothing is missing: the residuals are consistent with noise (family-wise p = {said.p:.2g})."
-    if said.verdict in WITHOUT_NAME and location is not None:
-        mechanism = said.mechanism
-        if said.verdict == "mechanism" and mechanism is not None:
-            within = _window_words(location) if location.family in mechanism.families else ""
-            text = f"Missing: {_mechanism(mechanism, within)} ({_evidence(said)}). "
-            text += "No law of the library is established."
-        else:
-            text = _without_name(location, _evidence(said), "is established" if said.missing else "explains it")
-            text += f" No mechanism is established: {no_mechanism(mechanism)}." if mechanism is not None else ""
-        if said.missing:
-            text += _tentative(said.missing, said.support)
-        elif said.nearest:
-            one = len(said.nearest) == 1
-            text += f" The nearest {'candidate is' if one else 'candidates are'} {' and '.join(said.nearest)}, but "
-            text += f"the tests do not support {'it' if one else 'them'}."
-        return text
-    names = [_effect_and_rivals(one) for one in said.missing if one.established]
-    in_model = _tentative([one for one in said.missing if not one.established], said.support)
-    place_sentence = "" if location is None else f" The {bases.place_in_words(location.place)} still has an error."
-    return f"Missing: {' and '.join(names)} ({_evidence(said)}).{in_model}{place_sentence}"
+def _mechanism_claim(said: loop_notes.VerdictSummary, where: DiscrepancyLocation, evidence: str) -> str:
+    """A mechanism with its evidence: share of the misfit, gain on held-out runs, and repeatability."""
+    found = said.mechanism
+    assert found is not None
+    names = " or ".join(map(with_article, found.families))
+    if where.family in found.families and where.window is not None:
+        names += f", {_shown(where)}"
+    errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
+    return (
+        f"Missing: {names}, established as a mechanism. It explains {100 * found.share:.0f} % of the misfit "
+        f"beyond noise, raises the log likelihood of held-out runs by {found.gain:.2g} per affected reading{errors}, "
+        f"and is found again in {100 * found.again:.0f} % of the fits without one block ({evidence}). No law of the "
+        "library is established."
+    )
 
 
-def _evidence(said: loop_notes.VerdictSummary) -> str:
-    """p-value, and the errors that remain where the refit misses a channel."""
-    remaining = map(_missed, said.missed)
-    unseen = f", but it still misses {', '.join(remaining)} on unseen runs" * bool(said.missed)
-    return f"family-wise p {p_value(said.p)}{unseen}"
+def _place_claim(said: loop_notes.VerdictSummary, where: DiscrepancyLocation, evidence: str) -> str:
+    """A place with the variable that shows it, and reasons why there is no more."""
+    others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
+    also = f" (or {', '.join(others)}, which these data cannot distinguish)" if others else ""
+    family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
+    no_effect = "is established" if said.missing else "explains it"
+    no_more = "" if said.mechanism is None else f" No mechanism is established: {no_mechanism(said.mechanism)}."
+    return (
+        f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}. No "
+        f"effect of the library {no_effect} ({evidence}).{no_more}"
+    )
+
+
+def _not_established(said: loop_notes.VerdictSummary) -> str:
+    """Effects that are in the model without an established name, or else the nearest candidates."""
+    if said.missing or not said.nearest:
+        return _tentative(said)
+    candidates, them = ("candidate is", "it") if len(said.nearest) == 1 else ("candidates are", "them")
+    return f" The nearest {candidates} {' and '.join(said.nearest)}, but the tests do not support {them}."
 
 
 def _missed(m: loop_notes.MissedChannel) -> str:
@@ -147,17 +162,6 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
     return (
         f"{UNDESCRIBED.capitalize()}: after the refit, it misses {', '.join(place_words)}. Check "
         f"first: {', and '.join(check)}."
-    )
-
-
-def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
-    """A mechanism with its evidence: share of the misfit, gain on held-out runs, and repeatability."""
-    names = " or ".join(map(with_article, found.families))
-    errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
-    return (
-        f"{names}{within}, established as a mechanism. It explains {100 * found.share:.0f} % of the misfit "
-        f"beyond noise, raises the log likelihood of held-out runs by {found.gain:.2g} per affected "
-        f"reading{errors}, and is found again in {100 * found.again:.0f} % of the fits without one block"
     )
 
 
@@ -255,17 +259,17 @@ def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
     return f"{family}{', or '.join([names_words, *values, *readings])} (these data cannot distinguish them)"
 
 
-def _tentative(those: Sequence[loop_notes.MissingEffect], support: loop_notes.NameSupport | None) -> str:
-    """Effects that are in the model without a name of their own, each with what speaks against it."""
-    if not those:
-        return ""
-    effect_words = [
-        f"{_effect_and_rivals(one)}, which {effect_doubts(one.test)}"
-        if effect_doubts(one.test)
-        else f"{_effect_and_rivals(one)} ({support_reasons(support)})"
-        for one in those
-    ]
-    return f" Tentative, kept because it improves predictions: {'; '.join(effect_words)}."
+def _tentative(said: loop_notes.VerdictSummary) -> str:
+    """Effects that are in the model without a name of their own, each with what speaks against it. All of them at a
+    verdict without a name.
+    """
+    words = [
+        f"{_effect_and_rivals(one)}, which {doubts}" if (doubts := effect_doubts(one.test))
+        else f"{_effect_and_rivals(one)} ({support_reasons(said.support)})"
+        for one in said.missing
+        if not one.established or said.verdict in WITHOUT_NAME
+    ]  # fmt: skip
+    return f" Tentative, kept because it improves predictions: {'; '.join(words)}." if words else ""
 
 
 def verdict_line(stages: LoopStages) -> str:
@@ -323,16 +327,6 @@ def search_progress(effects: Sequence[str], families: Sequence[str]) -> str:
     )
 
 
-def _without_name(where: DiscrepancyLocation, evidence: str, no_effect: str) -> str:
-    others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
-    also = f" (or {', '.join(others)}, which these data cannot distinguish)" if others else ""
-    family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
-    return (
-        f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}. No "
-        f"effect of the library {no_effect} ({evidence})."
-    )
-
-
 def _shown(where: DiscrepancyLocation) -> str:
     """Variable that shows a discrepancy, and equally significant others."""
     well = [
@@ -342,11 +336,6 @@ def _shown(where: DiscrepancyLocation) -> str:
     return variable_showing_discrepancy(where.variable, where.by_duty) + (
         f" (equally clear {', '.join(well)})" if well else ""
     )
-
-
-def _window_words(where: DiscrepancyLocation) -> str:
-    """The window of what happens for a while, after a comma, empty for other discrepancies."""
-    return "" if bases.window_from_name(where.variable) is None else f", {_shown(where)}"
 
 
 def variable_showing_discrepancy(variable: str, by_duty: bool = False) -> str:
