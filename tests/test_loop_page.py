@@ -18,8 +18,7 @@ from test_stated_values import traced as leads
 from worlds import settled, tables
 
 from calibration.data.writing import json_value
-from calibration.discovery.findings import RejectedCandidate, StatedValue
-from calibration.discovery.hidden import HiddenEffect
+from calibration.discovery.findings import HiddenEffect, RejectedCandidate, StatedValue
 from calibration.discovery.loop_notes import NameSupport, NameTest, RuledOut
 from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.result import WorseChannel
@@ -221,7 +220,7 @@ TOLD = {
         found, verdict="none", effects=(), support=None, summary=replace(found.summary, verdict="none")
     ),
     "hidden": lambda found: replace(found, hidden=(
-        HiddenEffect("brush_drop", 0.21, "V", 5.5, "stall", 7.2), HiddenEffect("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
+        HiddenEffect("brush_drop", 0.21, "V", 5.5), HiddenEffect("load_slip", 1e-4, "1/N", 5.1),
     )),
     "worse": lambda found: replace(found, held_out_worse=(WorseChannel("slope", "motor_speed", 10, 4.3, 4.7),)),
     "ruled_out": lambda found: replace(found, implausible=(RejectedCandidate(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -16,7 +17,6 @@ from calibration.discovery import (
     discrepancy,
     experiments,
     findings,
-    hidden,
     loop_input,
     prediction,
     result,
@@ -78,10 +78,10 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         if alike is None
         else findings.found_effects(table, screened.base.candidate, decided, alike, left.test, settings)
     )
-    concealed: tuple[hidden.HiddenEffect, ...] = ()
+    hidden: tuple[findings.HiddenEffect, ...] = ()
     if alike is not None and not nameless and run is None:
-        ask = kind.menu and not observe.long
-        concealed = hidden.find_hidden_effects(table, best, alike, left, traced.ends, settings, ask=ask)
+        named = tuple(itertools.chain(*alike.members))
+        hidden = findings.find_hidden_effects(table, named, left.scores, traced.ends.scores, settings)
     unnamed = None
     if nameless and traced.beside is not None and where is not None:
         p_value, simulated = left.test.p_value, run is not None
@@ -119,7 +119,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         needs_reverse=tuple(name for name, e in library if e.needs_reverse and not both_ways),
         alternatives=near,
         implausible=too_large,
-        hidden=concealed,
+        hidden=hidden,
         support=summary.support,
         cluster=screened.cluster,
         residual_clusters=find_residual_clusters(remaining, settings.seed),

@@ -489,3 +489,52 @@ def invisible_effects(
     weak = {s.name for s in by_effect if s.score < settings.visible**2}
     largest = zip(space.library.names, space.library.largest(np.asarray(scores.left)), strict=True)
     return tuple(name for name, x in largest if settings.plausible * x < settings.visible and name in weak)
+
+
+#: Rise of the objective up to which a joint fit is as good [σ²], and largest number of reported effects.
+SAME, MOST = 4.0, 6
+
+
+@dataclasses.dataclass(frozen=True)
+class HiddenEffect:
+    """An effect that the named effects of a fit could hide.
+
+    Attributes:
+        name: name of the effect.
+        amplitude: largest amplitude that would stay hidden, in `unit`.
+        sigmas: change of the readings by that amplitude, if the named effects were fixed [σ].
+    """
+
+    name: str
+    amplitude: float
+    unit: str
+    sigmas: float
+
+
+def find_hidden_effects(
+    space: CandidateSpace, named: Names, left: ScoreTable, after: ScoreTable, settings: Settings
+) -> tuple[HiddenEffect, ...]:
+    """Effects that may be present in addition to the named ones, which would hide them, the largest first.
+
+    At the fit with a name, a further effect may have any amplitude that raises the objective by no more than `SAME`:
+    b̂ ± √same sd. The name hides the effect if the largest plausible such amplitude, without the name, would change
+    the readings by `needed` sigmas. The two are then strongly correlated.
+
+    Args:
+        left, after: scores of the fits without and with the named effects.
+    """
+    hidden = []
+    for effect in space.library.effects:
+        m = space.library.best_instance(effect.name, np.asarray(left.left))
+        alone, beside = float(left.left[m]), float(after.left[m])
+        if effect.name in named or beside <= 0 or alone <= 0:
+            continue
+        centre, spread = float(after.amplitude[m]), np.sqrt(SAME) / beside
+        ends = np.clip([centre - spread, centre + spread], -settings.plausible, settings.plausible)
+        if effect.dissipative:
+            ends = np.maximum(ends, 0.0)
+        size = float(ends[np.argmax(np.abs(ends))])
+        if abs(size) * alone >= settings.needed and abs(size) * beside <= 2 * np.sqrt(SAME):
+            unit = linearization.amplitude_of(effect).spec.unit
+            hidden.append(HiddenEffect(effect.name, size * amplitude_unit(effect), unit, abs(size) * alone))
+    return tuple(sorted(hidden, key=lambda h: -h.sigmas)[:MOST])

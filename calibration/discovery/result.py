@@ -14,7 +14,6 @@ from calibration.data.runs import Runs
 from calibration.discovery import REFIT_FILE, findings, loop_notes, prediction
 from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.experiments import Proposal
-from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.settings import Settings
@@ -120,7 +119,7 @@ class DiscoveryResult:
     needs_reverse: Names
     alternatives: tuple[findings.RejectedCandidate, ...]
     implausible: tuple[findings.RejectedCandidate, ...]
-    hidden: tuple[HiddenEffect, ...]
+    hidden: tuple[findings.HiddenEffect, ...]
     support: loop_notes.NameSupport | None
     cluster: OutlierCluster | None
     residual_clusters: tuple[ResidualCluster, ...]

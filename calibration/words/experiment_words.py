@@ -140,8 +140,15 @@ def _temperature_limit(temperature: float) -> str:
 # --- what is proposed -----------------------------------------------------------------------------------
 
 
+#: Imposed quantity → its name, and its unit where people set it.
+IMPOSED = {
+    "voltage": ("voltage", "V"), "motor_speed": ("motor speed", "rpm"), "motor_current": ("motor current", "A"),
+}  # fmt: skip
+
+
 def instruction_for_further_runs(what: SimpleNamespace) -> str:
     """More runs along the variable of a discrepancy, from the values of `denser_runs_instruction`."""
+    (name, _), (_, angle, mass) = IMPOSED[what.within.imposed], what.steps
     if what.variable in bases.ORDERS:
         three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
         return (
@@ -152,8 +159,58 @@ def instruction_for_further_runs(what: SimpleNamespace) -> str:
     happens = bases.window_from_name(what.variable)
     if happens is not None:
         return _repeat_instruction(happens)
-    last = f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its range"
-    return _advice_by_variable(what).get(what.variable, last)
+    if what.variable == "slope":
+        return (
+            f"Repeat at one {name} and payload with slopes from 0 to {what.slope:g} deg in steps of {angle:g} deg, "
+            "and downhill"
+        )
+    if what.variable == "payload":
+        return f"Repeat at one {name} and slope with payloads from 0 to {what.payload:g} kg in steps of {mass:g} kg"
+    if what.variable == "time":
+        warm = f"{what.low:g} V or less" if name == "voltage" else f"one {name}"
+        return (
+            f"Record ten minutes at {warm} from a cold start, and again while warm. Watch the winding's "
+            f"temperature{_temperature_limit(what.within.hot)}"
+        )
+    if what.variable == "order":
+        return "Repeat the table in reverse order, and repeat one reference condition after every fifth run"
+    return _advice_on_drive(what) or (
+        f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its range"
+    )
+
+
+def _advice_on_drive(what: SimpleNamespace) -> str:
+    """More levels of what drives the motors, or of their load, empty for other variables."""
+    variable, within, (name, unit) = what.variable, what.within, IMPOSED[what.within.imposed]
+    volts, top = unit == "V", menu.round_significant(what.top)
+    if not volts:
+        usual = {"rpm": within.motor_speed / RPM, "A": within.current}[unit]
+        most = max((x / RPM if unit == "rpm" else x for x in within.levels), default=usual)
+        levels = f"the {name}{_up_to(most, what.runs, unit)}"
+    elif what.by_duty:
+        levels = f"the duty{_up_to(max(within.duties), what.runs, first='crawl')} at {top:g} V"
+    elif within.has_ground:
+        levels = f"the supply voltage in steps of {what.steps[0]:g} V from a crawl to {what.high:g} V"
+    else:
+        levels = f"the supply voltage{_up_to(what.top, what.runs, 'V', 'crawl')}"
+    fixed = f"{what.high:g} V" if volts else f"one {name}"
+    if variable == "voltage" and volts:
+        return f"Repeat {'at one slope and payload ' * within.has_ground}with {levels}"
+    if within.has_ground and volts and variable == "speed":
+        return f"Repeat on the level, unladen, with the speed in equal steps up to {within.speed:.2g} m/s at {fixed}"
+    if within.has_ground and volts and variable == "current":
+        load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
+        load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
+        loaded, most = " and ".join(load) or "a brake or a drawbar pull", within.current * within.motors
+        return f"Repeat at {fixed} with {loaded}, raised in small steps, up to {most:.2g} A"
+    if not within.has_ground and variable == "current" and any(within.torques):
+        most = max(within.torques)
+        factor, torque_unit = (1e3, "mN·m") if most < SMALL else (1.0, "N·m")
+        brake = f"the brake's torque{_up_to(factor * most, what.runs, torque_unit)}"
+        return f"Repeat at {f'{top:g} V' if volts else fixed} with {brake}"
+    if variable in ("speed_motor", "speed", *["current"] * (not within.has_ground)):
+        return f"Repeat {'on the level, unladen, ' * within.has_ground}with {levels}"
+    return ""
 
 
 def _repeat_instruction(happens: bases.Window) -> str:
@@ -171,14 +228,6 @@ def _repeat_instruction(happens: bases.Window) -> str:
     )
 
 
-def _steps(what: SimpleNamespace, first: str = "") -> str:
-    """`the supply voltage in 15 even steps up to 8 V`: what drives the motors, as the table varied it."""
-    top = menu.round_significant(what.top)
-    if what.by_duty:
-        return f"the duty{_up_to(max(what.within.duties), what.runs, first=first)} at {top:g} V"
-    return f"the supply voltage{_up_to(what.top, what.runs, 'V', first)}"
-
-
 def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
     """` from crawl to 12 V in steps of 1 V`: levels that a person can set."""
     step = menu.step_of_settings(most, runs)
@@ -188,66 +237,12 @@ def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
     )
 
 
-def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
-    """Advice by variable, for what is imposed on the motors and what they drive."""
-    high, within, by_duty, (volts, angle, mass) = what.high, what.within, what.by_duty, what.steps
-    speed, current = within.motor_speed, within.current
-    name, unit, usual = {
-        "voltage": ("voltage", "V", 0.0),
-        "motor_speed": ("motor speed", "rpm", speed / RPM),
-        "motor_current": ("motor current", "A", current),
-    }[within.imposed]
-    fixed, warm = f"one {name}", f"at one {name}"
-    advice = {}
-    if unit == "V":
-        fixed, warm = f"{high:g} V", f"at {what.low:g} V or less"
-        steps = (
-            _steps(what) if by_duty else f"the supply voltage from {what.low:g} to {high:g} V in steps of {volts:g} V"
-        )
-        crawl = f"the supply voltage in steps of {volts:g} V from a crawl to {high:g} V"
-        driven = crawl if within.has_ground and not by_duty else _steps(what, "crawl")
-        advice["voltage"] = (
-            f"Repeat at one slope and payload with {steps}" if within.has_ground else f"Repeat with {_steps(what)}"
-        )
-    else:
-        most = max((x / RPM if unit == "rpm" else x for x in within.levels), default=usual)
-        driven = f"the {name}{_up_to(most, what.runs, unit)}"
-    level = f"Repeat {'on the level, unladen, ' * within.has_ground}with {driven}"
-    advice |= dict.fromkeys(("speed_motor", "speed"), level)
-    if not within.has_ground:
-        top = f"{menu.round_significant(what.top):g} V" if unit == "V" else fixed
-        advice["current"] = f"Repeat at {top} with {_brake(what)}" if any(within.torques) else level
-    elif unit == "V":
-        load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
-        load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
-        loaded = " and ".join(load) or "a brake or a drawbar pull"
-        most = current * within.motors
-        advice["current"] = f"Repeat at {fixed} with {loaded}, raised in small steps, up to {most:.2g} A"
-        advice["speed"] = (
-            f"Repeat on the level, unladen, with the speed in equal steps up to {within.speed:.2g} m/s at {fixed}"
-        )
-    return {
-        **advice,
-        "slope": (
-            f"Repeat at one {name} and payload with slopes from 0 to {what.slope:g} deg in steps of {angle:g} deg, "
-            "and downhill"
-        ),
-        "payload": (
-            f"Repeat at one {name} and slope with payloads from 0 to {what.payload:g} kg in steps of {mass:g} kg"
-        ),
-        "time": (
-            f"Record ten minutes {warm} from a cold start, and again while warm. Watch the winding's "
-            f"temperature{_temperature_limit(within.hot)}"
-        ),
-        "order": "Repeat the table in reverse order, and repeat one reference condition after every fifth run",
-    }
-
-
-def _brake(what: SimpleNamespace) -> str:
-    """`the brake's torque up to 0.8 N·m in steps of 0.05 N·m`, as the table varied it."""
-    most = max(what.within.torques)
-    size, unit = (1e3, "mN·m") if most < SMALL else (1.0, "N·m")
-    return f"the brake's torque{_up_to(size * most, what.runs, unit)}"
+#: Imposed quantity → its name, and its unit where people set it.
+IMPOSED = {
+    "voltage": ("voltage", "V"),
+    "motor_speed": ("motor speed", "rpm"),
+    "motor_current": ("motor current", "A"),
+}
 
 
 #: Code of an instruction or of what to watch → a sentence with its values, or a function that makes one.

@@ -22,12 +22,14 @@ from mmrjax.errors import count_noun
 from mmrjax.model import params
 from sweeps.pages import words
 from sweeps.report import catalogue, drive_curves, fit_tables, run_tables
-from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table, remarks
+from sweeps.report.document import Block, Cell, Document, Note, Section, Table, remarks
 
 #: Smallest change of an rms error that is marked [%].
 NOTABLE = 0.05
 #: Distance of a fitted parameter from its stated value that the first screen states [prior sds].
 MOVED = 2.0
+#: First figure of the page, blocks that show every run, and blocks that show the missing term.
+_Figures = tuple[Block, Sequence[Block], Sequence[Block]]
 
 
 def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str, fit_tables.Change]) -> Document:
@@ -38,7 +40,9 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         changes: changes of settled runs by each effect.
     """
     table, shifts = rows_for_figures(found), list(moved_parameters(found))
-    first, run_by_run, missing_term = _figures(found, table, changes)
+    log = found.detail if isinstance(found.detail, TimeStatistics) else None
+    figures = _run_figures(found, table, changes) if log is None else _log_figures(found, log, table)
+    first, run_by_run, missing_term = figures
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
         f"Is the {words.displayed_robot_name(Path(robot_name).name)} model complete?",
@@ -57,60 +61,52 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
     )
 
 
-def _figures(
-    found: DiscoveryResult, table: Columns, changes: Mapping[str, fit_tables.Change]
-) -> tuple[Figure, list[Block], list[Block]]:
-    """First figure of the page, blocks that show every run, and blocks that show the missing term.
+def _log_figures(found: DiscoveryResult, detail: TimeStatistics, table: Columns) -> _Figures:
+    """Measured and simulated over time, the fits of every run, and the statistics that need histories."""
+    lines = {"after_": "simulated"}
+    if not found.refit_alone:
+        lines = {"after_": "with the effects found", "before_": "before"}
+    first = catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
+    runs = dataclasses.replace(found.runs, columns={**found.runs.columns, **table})
+    run_by_run = fit_tables.fits_of_runs(table, found.channels, lines)
+    before, after, unresolved = detail.before, detail.after, ", ".join(detail.orders_unresolved)
+    numbers = before.deviate, after.deviate, before.threshold, (2 * detail.runs) ** 0.5
+    more = catalogue.text("loop.unresolved", unresolved) if unresolved else ""
+    verdict = "none" if found.refit_alone else found.verdict
+    statistics = catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
+    responses = fit_tables.frequency_response(runs, found.channels, lines)
+    return first, [run_by_run, *responses], [statistics, *_curve(found)]
 
-    The first figure is the law that was found, on its readings. For logs or without a law: measured and simulated.
+
+def _run_figures(found: DiscoveryResult, table: Columns, changes: Mapping[str, fit_tables.Change]) -> _Figures:
+    """The law that was found on its readings, or else the curve or the residuals. Then the residuals of every run,
+    and the errors of the equations.
     """
-    verdict, detail = "none" if found.refit_alone else found.verdict, found.detail
-    curve = [] if found.unnamed is None else [_curve(found)]
-    if isinstance(detail, TimeStatistics):
-        lines = {"after_": "simulated"}
-        if not found.refit_alone:
-            lines = {"after_": "with the effects found", "before_": "before"}
-        runs = dataclasses.replace(found.runs, columns={**found.runs.columns, **table})
-        before, after = detail.before, detail.after
-        numbers = before.deviate, after.deviate, before.threshold, (2 * detail.runs) ** 0.5
-        names = ", ".join(detail.orders_unresolved)
-        more = catalogue.text("loop.unresolved", names) if names else ""
-        return (
-            catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement),
-            [
-                fit_tables.fits_of_runs(table, found.channels, lines),
-                *fit_tables.frequency_response(runs, found.channels, lines),
-            ],
-            [
-                catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more),
-                *curve,
-            ],
-        )
-    laws: list[Figure] = []
+    laws: list[Block] = []
     for name, change in changes.items():
         effect = next(e for e in found.effects if e.name == name)
         law = ", or ".join(effect.families), name, loop_words.effect_amplitude(effect)
         laws.append(catalogue.figure("loop.law", found, table, name, change, words=law, suffix=name if laws else ""))
-    residuals = catalogue.figure("loop.before_after", table, found.channels, verdict)
-    first, *others = [*laws, *curve, residuals]
-    missing_term: list[Block] = [*laws[1:]]
+    verdict, sized = "none" if found.refit_alone else found.verdict, Layout.of(found.robot).crosses_zero
+    residuals, curve = catalogue.figure("loop.before_after", table, found.channels, verdict), _curve(found)
+    closed = _closed(found, table) if sized else catalogue.text("loop.three")
+    defects = [catalogue.figure("loop.defects", table, verdict, sized, words=(closed,))]
     if drive_curves.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
         plane = lambda: drive_curves.drive_plane(found.robot, found.runs)  # noqa: E731
-        missing_term.append(catalogue.figure("run.drive_plane", values=plane))
-    sized = Layout.of(found.robot).crosses_zero
-    closed = _closed(found, table) if sized else catalogue.text("loop.three")
-    missing_term.append(catalogue.figure("loop.defects", table, verdict, sized, words=(closed,)))
-    missing_term += curve if laws else []
-    return first, [*others[-1:]], missing_term
+        defects.insert(0, catalogue.figure("run.drive_plane", values=plane))
+    if laws:
+        return laws[0], [residuals], [*laws[1:], *defects, *curve]
+    return (curve[0], [residuals], defects) if curve else (residuals, [], defects)
 
 
-def _curve(found: DiscoveryResult) -> Figure:
+def _curve(found: DiscoveryResult) -> list[Block]:
     """Figure of the smooth curve for an unnamed discrepancy."""
-    assert found.unnamed is not None
+    if found.unnamed is None:
+        return []
     key = "tentative" if found.effects else "written" if found.written else "left"
     key = "log" if isinstance(found.detail, TimeStatistics) else key
     more = catalogue.text(f"loop.curve-{key}", found.unnamed.effect)
-    return catalogue.figure("loop.curve", found.unnamed, words=(more,))
+    return [catalogue.figure("loop.curve", found.unnamed, words=(more,))]
 
 
 def rows_for_figures(found: DiscoveryResult) -> Columns:
@@ -298,11 +294,7 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
     tables: dict[str, list[tuple[Any, ...]]] = {
         "alternatives": [(_named(a.effects), a.rise_chi2) for a in found.alternatives],
         "hidden": [
-            (
-                h.name, f"{h.amplitude:.3g} {h.unit}".removesuffix(" -"), h.sigmas,
-                f"{h.experiment} (expected {h.separation:.1f} σ)" if h.experiment else "",
-            )
-            for h in found.hidden
+            (h.name, f"{h.amplitude:.3g} {h.unit}".removesuffix(" -"), h.sigmas) for h in found.hidden
         ],
         "implausible": [(_named(a.effects), _named(a.sizes), a.rise_chi2, a.why) for a in found.implausible],
     }  # fmt: skip
