@@ -87,7 +87,7 @@ def found(monkeypatch):
         space.bare.observe.reads, differs[0] = reads, run
         drawn = SimpleNamespace(chi2=(2 * BASE, 2 * BASE - curve), problem=None, z=None, reading=None)
         beside = SimpleNamespace(
-            where=where, curve=drawn, space=space, base=fitted(explains=0.0), left=left, bases=(),
+            where=where, fitted=drawn, space=space, base=fitted(explains=0.0), left=left, bases=(),
             settings=settings_for(SettledRuns),
         )  # fmt: skip
         return room.find_mechanism(beside, None, ladder, {})
