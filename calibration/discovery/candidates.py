@@ -353,9 +353,10 @@ def residuals_by_channel(
 
 def excess_misfit(space: CandidateSpace, base: Candidate) -> float:
     """χ² of the base fit, including priors, minus its expectation from noise (`Observer.noise_misfit`) [σ²]."""
-    counts, data = np.asarray(space.weight > 0), space.equipped.data
+    counts = np.asarray(space.weight > 0)
 
     def whitened() -> np.ndarray:  # residuals divided by their sds, 0 for excluded readings
+        data = space.equipped.data
         off = (simulated_reading(space, base) - np.asarray(data.measured)) / np.asarray(data.sd)
         return np.where(counts, np.nan_to_num(off), 0.0)
 
