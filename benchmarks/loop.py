@@ -234,7 +234,7 @@ def carried_out(case: Case, found, settings) -> list[dict]:
     from calibration.discovery import experiments
 
     left = experiments.alternatives_of_class(found.best, found.alike)
-    seen = whole = experiments.predict_menu(found.screened.base.space, left, settings)
+    seen = whole = experiments.predict_menu(found.screened.base.space, left)
     done: dict[str, dict] = {}
     said: list[dict] = []
     while len(seen.names) > 1 and len(said) < EXPERIMENTS:

@@ -86,9 +86,7 @@ class Ladder:
         names = [space.library.names[k] for k in np.argsort(-strength)[:BATCH]]
         wanted = [fill_slots([*candidate.effects, name], settings) for name in names]
         new = [w for w in wanted if frozenset(w) - {""} not in self.fitted]
-        found = fit_candidates(
-            space, [(w, start_of_fit(space, candidate, w, settings, scores)) for w in new], settings
-        )
+        found = fit_candidates(space, [(w, start_of_fit(space, candidate, w, scores)) for w in new])
         self.fitted |= {c.key: c for c in found}
         return [self.fitted[frozenset(w) - {""}] for w in wanted]
 
@@ -211,7 +209,7 @@ def base_of(given):
     space = build_candidate_space(
         given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library
     )
-    return fit_base(space, given.settings, given.runs.source)
+    return fit_base(space, given.runs.source)
 
 
 def work(task: Task) -> dict:

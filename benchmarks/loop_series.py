@@ -117,7 +117,7 @@ def _left(found, effect: dict, settings) -> dict:
     if not effect["class"]:
         return {}
     space = found.screened.base.space
-    left = {s.name: s.sigmas_per_prior_sd for s in effect_scores(space, found.left.scores, settings)}
+    left = {s.name: s.sigmas_per_prior_sd for s in effect_scores(space, found.left.scores)}
     if effect["class"] not in left:
         return {}
     sd = amplitude_unit(space.library[effect["class"]])

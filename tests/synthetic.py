@@ -69,7 +69,7 @@ class Analyst:
 
     def base(self, runs):
         """The base fitted to a table."""
-        return fit_base(self.space(runs), self.settings, runs.source)
+        return fit_base(self.space(runs), runs.source)
 
     def screened(self, runs):
         """The base fitted to a table, rows that stand alone set aside."""

@@ -102,12 +102,12 @@ def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypat
     # By an effect, a coordinate of the base and an amplitude: from a large one the second is lost beyond a fold.
     costs = {("a", 1, 9): 10.0, ("b", 1, 9): 5000.0, ("b", 1, 0): 30.0}
 
-    def fit(space, proposals, settings):
+    def fit(space, proposals):
         asked.append([(*names, *map(float, z)) for names, z in proposals])
         ends = [costs[*names, *z] for names, z in proposals]
         return [replace(candidate(p[0], c), z=np.array([1.0, 7.0])) for p, c in zip(proposals, ends, strict=True)]
 
-    def start(space, at, names, settings, scores=None):
+    def start(space, at, names, scores=None):
         return np.array([1.0, 9.0 if scores else 0.0])
 
     monkeypatch.setattr(candidates, "fit_candidates", fit)
@@ -115,10 +115,10 @@ def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypat
     base, space = candidate((), 20.0), SimpleNamespace(free=1)
     for lowest, kept in ((3.0, 3.0), (11.0, 10.0)):
         costs["a", 0, 7] = lowest
-        found = candidates.fit_in_addition(space, [(("a",), base, "scores"), (("b",), base, "scores")], None)
+        found = candidates.fit_in_addition(space, [(("a",), base, "scores"), (("b",), base, "scores")])
         assert [c.cost for c in found] == [kept, 30.0]
         assert asked.pop() == [("b", 1, 0), ("a", 0, 7)] and asked.pop() == [("a", 1, 9), ("b", 1, 9)]
-    assert candidates.fit_in_addition(space, [], None) == []
+    assert candidates.fit_in_addition(space, []) == []
 
 
 def test_two_threads_never_trace_at_once():

@@ -66,5 +66,5 @@ def test_a_negative_effect_is_excluded_where_its_balance_supplies_power(space, n
     z[space.free] = amplitude / float(space.coordinates.sd[space.library.names.index(name)])
     sizes = np.where([bool(n) for n in active], amplitude, 0.0)
     assert supplying_effects(space, active, sizes, z) == ((name,) if supplies else ())
-    found = candidate_of_fit(space, active, Optimum(z, 0.1 + 0 * z, np.eye(len(z)), 1.0, 0.0, True, 1), settings)
+    found = candidate_of_fit(space, active, Optimum(z, 0.1 + 0 * z, np.eye(len(z)), 1.0, 0.0, True, 1))
     assert found.supplying == ((name,) if supplies else ()) and not (supplies and found.plausible)

@@ -109,9 +109,9 @@ def seen():
         case = tables.narrow([pair[0]], 12.0, seed=3)
         space = SETTLED.space(table(case))
         start = np.zeros(len(space.coordinates))
-        fitted = fit_candidates(space, [(fill_slots([name], SETTINGS), start) for name in pair], SETTINGS)
+        fitted = fit_candidates(space, [(fill_slots([name], SETTINGS), start) for name in pair])
         answers[pair] = case, space, dict(zip(pair, fitted, strict=True))
-    return {p: (c, space, f, experiments.predict_menu(space, f, SETTINGS)) for p, (c, space, f) in answers.items()}
+    return {p: (c, space, f, experiments.predict_menu(space, f)) for p, (c, space, f) in answers.items()}
 
 
 @pytest.mark.nightly
@@ -395,11 +395,11 @@ def test_runs_against_a_brake_have_its_torque():
 def test_forbidden_and_impossible_experiments_are_not_proposed(seen):
     _, space, fitted, free = seen["series_resistance", "supply_sag"]
     barred = ("stall", "one motor", "4W2T")
-    left = experiments.predict_menu(space, fitted, replace(SETTINGS, forbidden=barred))
+    left = experiments.predict_menu(replace(space, settings=replace(SETTINGS, forbidden=barred)), fitted)
     assert not {*barred} & {k for e in left.experiments for k in e.kinds}
     assert {e.name for e in left.experiments} < {e.name for e in free.experiments}
     assert left.value.shape[1] == sum(reading_count(e) for e in left.experiments) == len(left.sd)
-    none = experiments.predict_menu(space, fitted, replace(SETTINGS, forbidden=menu.KINDS))
+    none = experiments.predict_menu(replace(space, settings=replace(SETTINGS, forbidden=menu.KINDS)), fitted)
     nothing = experiments.choose_experiment(none)
     assert nothing.name == experiments.NONE and nothing.instruction == Remark("nothing_possible")
 
@@ -477,6 +477,6 @@ def test_a_class_of_a_servos_log_has_no_experiment_of_the_menu():
     base = types.SimpleNamespace(rig=Rig(imposed="goal_angle"))
     space = types.SimpleNamespace(bare=types.SimpleNamespace(observe=seen, base=base))
     traced = types.SimpleNamespace(verdict="class", where=None, alike=object())
-    proposal = assembly._next_experiment(space, traced, None)
+    proposal = assembly._next_experiment(space, traced)
     assert proposal.experiments == (experiments.NONE,)
     assert describe(proposal.instruction).endswith("no experiments for goals of a controller")

@@ -66,7 +66,7 @@ def hot(looks):
 
 def listed(traced, cost):
     space, base = traced.screened.base.space, traced.screened.base.candidate
-    return listed_alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
+    return listed_alternatives(space, base, cost, traced.searched.ladder)
 
 
 def test_heating_of_a_plausible_size_is_named():
@@ -105,7 +105,7 @@ def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):
         of("supply_sag", cost=101.0), of("churning", "load_slip", cost=99.0), of("churning", "mass_offset", cost=90.0),
         of("supply_sag", "load_slip", cost=100.5), of("series_resistance", cost=98.0, plausible=False), best,
     )  # fmt: skip
-    plausible, ruled_out = listed_alternatives(space, best, best.cost, ladder, SETTLED.settings)
+    plausible, ruled_out = listed_alternatives(space, best, best.cost, ladder)
     assert [(tuple(a.effects), a.rise_chi2) for a in plausible] == [
         (("churning", "mass_offset"), -20.0),
         (("supply_sag",), 2.0),
@@ -137,7 +137,6 @@ def test_an_effect_without_a_p_of_its_own_is_not_proposed(looks):
             base.candidate,
             replace(found.left, test=of),
             found.screened.bases,
-            analyst.settings,
             lambda text: None,
         ).best
         for of in (test, loud)

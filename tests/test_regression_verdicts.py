@@ -117,7 +117,7 @@ def answered(tmp_path_factory):
 
     def of(**faults):
         space = space_of(**faults)
-        return findings.rank_effects_by_weak_form(space, search.screen_by_weak_form(space, SETTINGS), SETTINGS)
+        return findings.rank_effects_by_weak_form(space, search.screen_by_weak_form(space))
 
     @functools.cache
     def windows_of(**faults):
@@ -172,11 +172,9 @@ def test_windows_fit_effects_as_least_squares_do(answered):
     """A log is a table of equations: residuals, slopes and signatures of its regression, and shapes between them."""
     space, fit, posed, rows = answered.windows_of(forward=0.3)
     observe, names = posed.observe, space.library.names
-    table = active_set.candidate_space(
-        posed, space.library.effects, {n: BY_NAME[n] for n in NAMES}, 4, SETTINGS.width
-    )
+    table = active_set.candidate_space(posed, space.library.effects, {n: BY_NAME[n] for n in NAMES}, SETTINGS)
     slots = ("directional_friction", "supply_sag", "", "")
-    (found,) = candidates.fit_candidates(table, [(slots, np.zeros(table.free + 8))], SETTINGS)
+    (found,) = candidates.fit_candidates(table, [(slots, np.zeros(table.free + 8))])
     linear, size = observe.linear, table.free
     counts = np.asarray(posed.data.weight).ravel() > 0
     e, j, g = (

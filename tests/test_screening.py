@@ -84,6 +84,7 @@ def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
 
 # --- the first answer -------------------------------------------------------------------------------------
 
+TWO_SLOTS = dataclasses.replace(ANALYST.settings, slots=2)
 RANKING = EffectRanking(
     True, 0.002, 9.0,
     (EffectScore("churning", "track", 412.0, 0.0123, 1.0, 0.0004, "loss torque that changes with speed", "N·m"),
@@ -176,15 +177,15 @@ def test_effects_that_remain_without_another_take_the_first_slots(monkeypatch):
     """A gap in the slots shifted the columns of a class, or ended a loop on 509 rows with an internal error."""
     asked = []
 
-    def fit_candidates(space, proposals, settings):
+    def fit_candidates(space, proposals):
         asked.extend(proposals)
         return [SimpleNamespace(active=active) for active, _ in proposals]
 
     monkeypatch.setattr(search, "fit_candidates", fit_candidates)
-    settings = dataclasses.replace(ANALYST.settings, slots=3)
+    space = SimpleNamespace(free=2, settings=dataclasses.replace(ANALYST.settings, slots=3))
     z, zeros = np.arange(2 + 6.0), np.zeros(3)  # two base parameters, then amplitudes and shapes
     best = Candidate(("churning", "brush_drop", ""), z, z, 0.0, zeros, zeros, True, True, True)
-    fewer = search.refit_without_each(SimpleNamespace(free=2), best, settings)
+    fewer = search.refit_without_each(space, best)
     assert [c.active for c in fewer] == [("brush_drop", "", ""), ("churning", "", "")]
     assert_allclose(asked[0][1], [0, 1, 3, 0, 0, 6, 0, 0])
 
@@ -209,7 +210,7 @@ def test_a_search_from_a_regression_that_does_not_converge_is_repeated_from_the_
         weight=np.ones(3),
     )
     regression = SimpleNamespace(z=np.array([-2.9, 1.0, 0.0]), simulated=False)
-    optima_found, _ = candidates._best_starts(space, ANALYST.settings, regression)
+    optima_found, _ = candidates._best_starts(space, regression)
     assert [b.tolist() for b in begun] == [[[-2.9, 1.0]]] + [[[0.0, 0.0]]] * (not converged)
     assert np.min(optima_found.cost) == (931.0 if converged else 408.0)
 
@@ -286,7 +287,7 @@ def test_linear_readings_are_those_of_the_simulation_at_and_near_the_fit(space, 
 
 def test_linear_readings_change_with_a_small_amplitude_as_the_simulation_does(space, linear):
     z, problem = linear
-    table = candidate_space(problem, space.library.effects, ANALYST.library, 2, ANALYST.settings.width)
+    table = candidate_space(problem, space.library.effects, ANALYST.library, TWO_SLOTS)
     active = ("brush_drop", "")
     some = np.concatenate([z, [0.01, 0.0, 0.0, 0.0]])
 
@@ -302,13 +303,13 @@ def test_linear_readings_change_with_a_small_amplitude_as_the_simulation_does(sp
 
 def test_a_row_without_weight_does_not_change_a_linear_fit(space, linear):
     z, problem = linear
-    table = candidate_space(problem, space.library.effects, ANALYST.library, 2, ANALYST.settings.width)
-    (without,) = candidates.fit_candidates(table.without([3]), [(("", ""), np.pad(z, (0, 4)))], ANALYST.settings)
+    table = candidate_space(problem, space.library.effects, ANALYST.library, TWO_SLOTS)
+    (without,) = candidates.fit_candidates(table.without([3]), [(("", ""), np.pad(z, (0, 4)))])
     wrong = dataclasses.replace(table.without([3]))
     data = wrong.equipped.data
     data = dataclasses.replace(data, measured=data.measured.at[3].add(1e3))
     wrong = dataclasses.replace(wrong, equipped=dataclasses.replace(wrong.equipped, data=data))
-    (other,) = candidates.fit_candidates(wrong, [(("", ""), np.pad(z, (0, 4)))], ANALYST.settings)
+    (other,) = candidates.fit_candidates(wrong, [(("", ""), np.pad(z, (0, 4)))])
     assert_allclose(other.z, without.z, atol=1e-9)
 
 
@@ -337,7 +338,7 @@ def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, room, c
     screened = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(weight=None)), bases=())
     searched = search.SearchResult(tuple(ladder), ladder[2], diagnosis(False))
     noise = SimpleNamespace(sd=None)
-    best = log_stages.smallest_confirmed(space, None, screened, diagnosis(True), searched, noise).best
+    best = log_stages.smallest_confirmed(space, screened, diagnosis(True), searched, noise).best
     assert " ".join(best.effects) == chosen
 
 
@@ -356,6 +357,6 @@ def test_windows_propose_no_larger_set_whose_simulation_leaves_more(cost, chosen
     screened = SimpleNamespace(base=SimpleNamespace(space=None), bases=())
     left = SimpleNamespace(test=SimpleNamespace(null=None))
     searched = search.SearchResult((small, large), large, "of both")
-    found = log_stages.best_simulated_size(space, None, screened, left, searched, None)
+    found = log_stages.best_simulated_size(space, screened, left, searched, None)
     assert " ".join(found.best.effects) == chosen
     assert found.diagnosis == ("of both" if found.best is large else "diagnosis")

@@ -48,7 +48,7 @@ def is_global(adhesion, creep, seed=3):
     space = ANALYST.space(runs)
     z = jnp.asarray(at_truth(space, p))
     truth = 0.5 * float(jnp.sum(space.bare.misfit(z) ** 2) + jnp.sum(z**2))
-    fitted = fit_base(space, ANALYST.settings, "starts")
+    fitted = fit_base(space, "starts")
     assert fitted.unusable == () and fitted.candidate.cost < truth, (adhesion, creep)
     readings = 3 * len(runs)
     assert abs(2 * fitted.candidate.cost - readings) < 5 * np.sqrt(2 * readings), (adhesion, creep)

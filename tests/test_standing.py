@@ -522,7 +522,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
     monkeypatch.setattr(
         stages.candidates,
         "fit_candidates",
-        lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
+        lambda space, wanted: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
     )
     monkeypatch.setattr(stages.blocks_room, "predictable_blocks", lambda *a: {"slope": {"0": np.ones(3, bool)}})
     bare = SimpleNamespace(observe=SimpleNamespace(long=False, reads=True, over_time=False, blocks=("slope",)))

@@ -94,7 +94,7 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     analyst, grid = looks
     runs = made(**wrong, grid=grid)
     fitted = analyst.base(runs)
-    found = {s.name: s for s in find_prior_shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings)}
+    found = {s.name: s for s in find_prior_shifts(fitted.space, fitted.candidate, NEEDED)}
     assert "motor.resistance" in found
     shift = found["motor.resistance"]
     sd = shift.fit.sd[fitted.space.coordinates.base.names.index(shift.name)] * NOMINAL * 0.1
@@ -112,7 +112,7 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
 def test_nothing_is_shifted_where_the_sheet_is_right(looks):
     analyst, grid = looks
     fitted = analyst.base(made(grid=grid))
-    assert find_prior_shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings) == []
+    assert find_prior_shifts(fitted.space, fitted.candidate, NEEDED) == []
 
 
 def test_verdict_lists_the_resistance_that_may_be_wrong(looks):

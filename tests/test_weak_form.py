@@ -51,7 +51,7 @@ def posed(runs, robot, sd=SD, library=None):
 
 @pytest.fixture(scope="module")
 def before(space):
-    return search.screen_by_weak_form(space, SETTINGS)
+    return search.screen_by_weak_form(space)
 
 
 def test_a_window_integrates_by_parts():
@@ -80,7 +80,7 @@ def test_base_parameters_are_those_of_the_log(space, before):
 
 
 def test_the_effect_of_the_log_is_ranked_first_and_not_by_chance(space, before):
-    found = findings.rank_effects_by_weak_form(space, before, SETTINGS)
+    found = findings.rank_effects_by_weak_form(space, before)
     assert found.missing and found.windows == before.windows > 0
     assert "churning" in [e.name for e in found.effects[:2]]
     assert found.effects[0].score > found.chance
@@ -89,7 +89,7 @@ def test_the_effect_of_the_log_is_ranked_first_and_not_by_chance(space, before):
 def test_the_ranking_comes_before_the_base_fit_which_begins_there(space, before, monkeypatch):
     begun, kept = [], []
 
-    def fit_base(space, settings, where, near=None):
+    def fit_base(space, where, near=None):
         begun.append(near)
         raise InterruptedError
 
@@ -197,11 +197,11 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     columns = motor(noise=(0.0, 1.0) if imposed == "motor_speed" else (1.0, 0.0))
     del columns["supply_voltage_V"]
     mine = posed(read_table(tmp_path, csv_text(columns), robot).of(robot), robot, SD[int(channel == "motor_current")])
-    found = search.screen_by_weak_form(mine, SETTINGS)
+    found = search.screen_by_weak_form(mine)
     names, value = mine.coordinates.base.names, mine.coordinates.base.value(found.base.z[: mine.free])
     ratio = value[names.index("motor.inertia")] / value[names.index("motor.torque_constant")]
     assert ratio == pytest.approx(TRUE["inertia"] / TRUE["torque_constant"], rel=0.03)
-    ranked = findings.rank_effects_by_weak_form(mine, found, SETTINGS)
+    ranked = findings.rank_effects_by_weak_form(mine, found)
     assert imposed == "motor_speed" or "churning" in [e.name for e in ranked.effects[:2]]
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from calibration.data import Names
 from calibration.data.effect_file import Library
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_posteriors
+from calibration.discovery.settings import Settings
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.linearization import (
     Linearization,
@@ -159,12 +160,14 @@ class CandidateSpace:
         bare: problem of the base alone.
         equipped: problem of the base and the effects in the slots.
         library: effects that the slots can hold.
+        settings: statistical constants of the search.
         room: names of the effects that the compiled fits of time histories include, see `problem_for_sets`.
     """
 
     bare: Problem
     equipped: Problem
     library: ScoredLibrary
+    settings: Settings
     room: Names = ()
 
     @property
@@ -258,17 +261,16 @@ def with_only(robot: Robot, names: Collection[str]) -> Robot:
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))
 
 
-def candidate_space(
-    bare: Problem, effects: Sequence[Effect], library: Library, slots: int, width: float
-) -> CandidateSpace:
-    """Candidate space of a base problem, with slots for effects of a library (number of slots: see `Settings`)."""
+def candidate_space(bare: Problem, effects: Sequence[Effect], library: Library, settings: Settings) -> CandidateSpace:
+    """Candidate space of a base problem, with slots for effects of a library."""
+    slots = settings.slots
     shapes = [free_shape_parameter(e) for e in effects]
     scales = [shape_scales(s) for s in shapes]
     value, spread, sd, low, high = (jnp.asarray([s[k] for s in scales]) for k in range(5))
     coordinates = ActiveSet(
         bare.coordinates,
         jnp.full(slots, -1, int),
-        width * jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in effects]),
+        settings.width * jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in effects]),
         (value, spread, sd, low, high),
         tuple(e.name for e in effects),
         tuple("" if s is None else s.name for s in shapes),
@@ -283,6 +285,7 @@ def candidate_space(
         bare,
         Problem(robot, coordinates, bare.observe, data),
         ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids])),
+        settings,
     )
 
 

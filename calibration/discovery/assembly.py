@@ -24,7 +24,7 @@ from calibration.discovery import (
     verdict,
 )
 from calibration.discovery.scales import goes_both_ways
-from calibration.discovery.settings import WITHOUT_NAME, Settings
+from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks as blocks_room
 from calibration.inference import fit_notes
 from calibration.inference.residual_clusters import find_residual_clusters
@@ -74,21 +74,19 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
     # What the loop claims: effects or an unnamed discrepancy, and what may be present in addition or instead.
     decided = dataclasses.replace(best, cost=traced.best.cost)
     effects = (
-        ()
-        if alike is None
-        else findings.found_effects(table, screened.base.candidate, decided, alike, left.test, settings)
+        () if alike is None else findings.found_effects(table, screened.base.candidate, decided, alike, left.test)
     )
     hidden: tuple[findings.HiddenEffect, ...] = ()
     if alike is not None and not nameless and run is None:
         named = tuple(itertools.chain(*alike.members))
-        hidden = findings.find_hidden_effects(table, named, left.scores, traced.ends.scores, settings)
+        hidden = findings.find_hidden_effects(table, named, left.scores, traced.ends.scores)
     unnamed = None
     if nameless and traced.beside is not None and where is not None:
         p_value, simulated = left.test.p_value, run is not None
         unnamed = findings.unnamed_discrepancy(traced.beside, where, p_value, len(runs), simulated)
     ladder = () if traced.searched is None else (alike or traced.searched).ladder
-    near, too_large = findings.listed_alternatives(table, traced.best, decided_cost, ladder, settings)
-    scores, both_ways = findings.effect_scores(table, left.scores, settings), goes_both_ways(runs)
+    near, too_large = findings.listed_alternatives(table, traced.best, decided_cost, ladder)
+    scores, both_ways = findings.effect_scores(table, left.scores), goes_both_ways(runs)
     summary, library = verdict.verdict_summary(traced, numbers), sorted(given.library.items())
     remaining = candidates.residuals_by_channel(space, runs, after.linear, readings.after, z)
     with np.errstate(invalid="ignore"):
@@ -113,8 +111,8 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         effects=effects,
         unnamed=unnamed,
         remains=None if nameless or alike is None else where,
-        next_experiment=_next_experiment(table, traced, settings),
-        cannot_see=findings.invisible_effects(table, left.scores, scores, settings),
+        next_experiment=_next_experiment(table, traced),
+        cannot_see=findings.invisible_effects(table, left.scores, scores),
         needs_histories=tuple(name for name, e in library if e.transient and not kind.shows(e)),
         needs_reverse=tuple(name for name, e in library if e.needs_reverse and not both_ways),
         alternatives=near,
@@ -197,9 +195,7 @@ def _hold_out_gains(
     return tuple((names, score(reading).gain(before)) for names, reading in scored)
 
 
-def _next_experiment(
-    space: active_set.CandidateSpace, traced: verdict.LoopStages, settings: Settings
-) -> experiments.Proposal | None:
+def _next_experiment(space: active_set.CandidateSpace, traced: verdict.LoopStages) -> experiments.Proposal | None:
     """Next experiment. None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
@@ -208,10 +204,8 @@ def _next_experiment(
         remark = fit_notes.Remark("no_menu", word="goals of a controller" if follows_goal else observe.word)
         return experiments.Proposal((experiments.NONE,), remark) if traced.verdict != "none" else None
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
-        return experiments.propose_denser_runs(space, traced.where, settings)
-    return (
-        None if traced.alike is None else experiments.propose_separating(space, traced.best, traced.alike, settings)
-    )
+        return experiments.propose_denser_runs(space, traced.where, space.settings)
+    return None if traced.alike is None else experiments.propose_separating(space, traced.best, traced.alike)
 
 
 def posterior_of_curve(

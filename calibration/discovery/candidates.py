@@ -140,14 +140,16 @@ def fill_slots(effects: Sequence[str], settings: Settings) -> Names:
     return (*effects, *("",) * (settings.slots - len(effects)))
 
 
-def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum, settings: Settings) -> Candidate:
+def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum) -> Candidate:
     """Candidate with the result of a fit and the plausibility of its amplitudes."""
     amplitude, spread = (
-        np.where([bool(name) for name in active], settings.width * np.asarray(space.coordinates.parts(x)[1]), 0.0)
+        np.where(
+            [bool(name) for name in active], space.settings.width * np.asarray(space.coordinates.parts(x)[1]), 0.0
+        )
         for x in (best.z, best.sd)
     )
     size, near = (
-        np.array([_relative_amplitude(space, n, a, settings) for n, a in zip(active, x, strict=True)])
+        np.array([_relative_amplitude(space, n, a) for n, a in zip(active, x, strict=True)])
         for x in (amplitude, spread)
     )
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
@@ -155,11 +157,11 @@ def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum, settin
     supplies = supplying_effects(space, active, amplitude, z) if np.isfinite(cost) else ()
     # An amplitude within an sd of a bound is held by it, unless its sd is as large as the whole plausible range.
     ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and not supplies
-    nearly = bool(np.all(size < settings.stretched)) and not supplies
+    nearly = bool(np.all(size < space.settings.stretched)) and not supplies
     return Candidate(active, z, sd, cost, amplitude, size, ok, nearly, bool(best.converged), supplies)
 
 
-def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:
+def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float) -> float:
     """Amplitude relative to the largest plausible one of its sign [-]. The amplitude is given in prior sds. 0 for an
     empty slot.
     """
@@ -168,7 +170,7 @@ def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float, sett
     spec = amplitude_of(space.library[name]).spec
     unit = spec.prior_sd(0.0)
     bound = max(spec.bounds[1] if amplitude > 0 else -spec.bounds[0], 0.0) / unit
-    return abs(amplitude) / max(min(settings.plausible, bound), 1e-9)
+    return abs(amplitude) / max(min(space.settings.plausible, bound), 1e-9)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,15 +190,15 @@ class BaseFit:
     unusable: tuple[int, ...]
 
 
-def with_slots(best: Optimum, space: CandidateSpace, settings: Settings) -> Optimum:
+def with_slots(best: Optimum, space: CandidateSpace) -> Optimum:
     """Optimum of the base with the coordinates of empty slots."""
-    empty = np.zeros(2 * settings.slots)
+    empty = np.zeros(2 * space.settings.slots)
     z, sd = np.append(best.z[: space.free], empty), np.append(best.sd[: space.free], empty + 1)
     fit: dict[str, Any] = {"z": z, "sd": sd}
     return dataclasses.replace(best, **fit)
 
 
-def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candidate | None = None) -> BaseFit:
+def fit_base(space: CandidateSpace, where: str, near: Candidate | None = None) -> BaseFit:
     """Fits the base without effects, from its prior mean and from random draws of its prior.
 
     If the robot cannot reach some rows at all, they are excluded and the fit is repeated.
@@ -213,14 +215,14 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
     unusable = tuple(map(int, np.flatnonzero(unusable_rows)))
     space = space.without(unusable_rows) if unusable else space
     while True:
-        optima, observations = _best_starts(space, settings, near)
+        optima, observations = _best_starts(space, near)
         # The first of those that end in one place, because rounding decides which of them is the lowest.
         cost = np.where(np.isfinite(optima.cost), optima.cost, np.inf)
         k = int(np.argmax(cost <= np.min(cost) + ALIKE))
         unusable_rows = space.bare.observe.unreachable(np.asarray(observations.status[k])) & space.included
         if not unusable_rows.any():
             best = jax.tree.map(lambda x: x[k], optima)  # noqa: B023
-            fit = candidate_of_fit(space, fill_slots((), settings), with_slots(best, space, settings), settings)
+            fit = candidate_of_fit(space, fill_slots((), space.settings), with_slots(best, space))
             return BaseFit(fit, np.asarray(observations.reading[k]), space, unusable)
         unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(unusable_rows))}))
         space = space.without(unusable_rows)
@@ -242,7 +244,7 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
     return (np.asarray(observation.status) == SLIDES) & space.included
 
 
-def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
+def _best_starts(space: CandidateSpace, near: Candidate | None) -> tuple[Optimum, Observation]:
     """Best fit of the base from several starts that the data suggest, and the simulated observation there.
 
     A search from a regression that does not converge is repeated from the prior mean.
@@ -254,7 +256,7 @@ def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | No
             mean = [np.zeros(space.free)] * bool(np.abs(starts).max() > UNLIKELY)
             starts = scans.place_at_minimum(bare, np.stack([*starts, *mean]))
     else:
-        starts = observe.starts(bare, np.random.default_rng(settings.seed), observe.policy.searches)
+        starts = observe.starts(bare, np.random.default_rng(space.settings.seed), observe.policy.searches)
     rivals = regression or near is None or not observe.long  # a fit of the same runs has scanned them
 
     def search(starts: np.ndarray) -> tuple[Optimum, Observation]:
@@ -271,21 +273,19 @@ def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | No
 Proposal = tuple[Names, np.ndarray]
 
 
-def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
+def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal]) -> list[Candidate]:
     """Fits each set of effects from its start."""
     if not proposals:
         return []
     problem, active = space.problem_for_sets(names for names, _ in proposals)
     optima, _ = fit_from_each_start(problem, [z for _, z in proposals], [space.weight] * len(proposals), active)
     return [
-        candidate_of_fit(space, names, jax.tree.map(lambda x: x[k], optima), settings)  # noqa: B023
+        candidate_of_fit(space, names, jax.tree.map(lambda x: x[k], optima))  # noqa: B023
         for k, (names, _) in enumerate(proposals)
     ]
 
 
-def fit_in_addition(
-    space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, ScoreTable]], settings: Settings
-) -> list[Candidate]:
+def fit_in_addition(space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, ScoreTable]]) -> list[Candidate]:
     """Fits effects in addition to those of a previous fit. Their scores give the start.
 
     A result that is worse than the previous fit started where no solution exists. It is repeated from the previous
@@ -296,14 +296,12 @@ def fit_in_addition(
         wanted: (active effects, previous fit, scores of its residuals). The active effects include those of the
             previous fit.
     """
-    fits = fit_candidates(
-        space, [(w, start_of_fit(space, base_fit, w, settings, scores)) for w, base_fit, scores in wanted], settings
-    )
+    fits = fit_candidates(space, [(w, start_of_fit(space, base_fit, w, scores)) for w, base_fit, scores in wanted])
     stuck = [k for k, (_, base_fit, _) in enumerate(wanted) if not fits[k].cost <= base_fit.cost + STUCK]
-    restarts = [(k, start_of_fit(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
+    restarts = [(k, start_of_fit(space, wanted[k][1], wanted[k][0])) for k in stuck]
     for k in sorted(range(len(fits)), key=lambda k: fits[k].cost)[:1]:
         restarts.append((k, np.where(np.arange(len(fits[k].z)) < space.free, 0.0, fits[k].z)))
-    refits = fit_candidates(space, [(wanted[k][0], z) for k, z in restarts], settings)
+    refits = fit_candidates(space, [(wanted[k][0], z) for k, z in restarts])
     for (k, _), refit in zip(restarts, refits, strict=True):
         fits[k] = refit if refit.cost < fits[k].cost - STUCK else fits[k]
     return fits
@@ -313,13 +311,12 @@ def start_of_fit(
     space: CandidateSpace,
     at: Candidate,
     active: Names,
-    settings: Settings,
     scores: ScoreTable | None = None,
 ) -> np.ndarray:
     """Start of a fit of `active`: coordinates of another fit, with each new effect at the amplitude that its score
     estimates.
     """
-    p, s = space.free, settings.slots
+    p, s = space.free, space.settings.slots
     z = np.zeros(p + 2 * s)
     z[:p] = at.z[:p]
     for slot, name in enumerate(active):
@@ -328,7 +325,7 @@ def start_of_fit(
             z[p + slot], z[p + s + slot] = at.z[p + old], at.z[p + s + old]
         elif name and scores is not None:
             m = space.library.best_instance(name, np.asarray(scores.single))
-            z[p + slot] = np.clip(float(scores.amplitude[m]) / settings.width, -1.5, 1.5)
+            z[p + slot] = np.clip(float(scores.amplitude[m]) / space.settings.width, -1.5, 1.5)
             z[p + s + slot] = space.library.at[m]
     return z
 

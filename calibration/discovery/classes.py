@@ -62,7 +62,7 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
 
 
 def find_prior_shifts(
-    space: CandidateSpace, at: Candidate, needed: float, settings: Settings, linear: Linearization | None = None
+    space: CandidateSpace, at: Candidate, needed: float, linear: Linearization | None = None
 ) -> list[Shift]:
     """Base parameters that reduce the χ² of a fit by at least `needed` [σ²] if their prior is dropped.
 
@@ -80,16 +80,14 @@ def find_prior_shifts(
     for k in np.argsort(-explained[:p]):
         if explained[k] < needed:
             break
-        fit = _fit_without_prior(space, at, int(k), float(values[k]), settings)
+        fit = _fit_without_prior(space, at, int(k), float(values[k]))
         if fit is not None:
             value, stated = (float(base.value(np.asarray(z))[k]) for z in (fit.z[:p], np.zeros(p)))
             shifts.append(Shift(base.names[k], value, stated, base.units[k], float(fit.z[k]), fit))
     return shifts
 
 
-def _fit_without_prior(
-    space: CandidateSpace, at: Candidate, k: int, value: float, settings: Settings
-) -> Candidate | None:
+def _fit_without_prior(space: CandidateSpace, at: Candidate, k: int, value: float) -> Candidate | None:
     """Fit without the prior of coordinate k: the mean of the prior is moved to the estimate from the data.
 
     None if the estimate is outside the bounds of the parameter, or if the fit does not converge.
@@ -111,7 +109,7 @@ def _fit_without_prior(
         mean, start = float(z[k]), z.copy()
     if space.coordinates.base.beyond(z[:p])[k]:
         return None
-    return candidate_of_fit(space, at.active, best, settings)
+    return candidate_of_fit(space, at.active, best)
 
 
 # --- classes --------------------------------------------------------------------------------------
@@ -164,7 +162,7 @@ def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ..
     cosine = np.zeros((len(names), len(names)))
     np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(left.scores.cosine))
     one = len(best.effects) == 1
-    fewer = [beside.base] if one else refit_without_each(space, best, settings, ladder)
+    fewer = [beside.base] if one else refit_without_each(space, best, ladder)
     rivals: dict[tuple[str, str], Names] = {}
     for name in best.effects:
         parallel = cosine[names.index(name)]
@@ -173,7 +171,7 @@ def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ..
                 rivals[name, names[j]] = best.with_effect(name, names[j])
     fits = {c.key: c for c in ladder}
     new = [active for active in rivals.values() if frozenset(active) - {""} not in fits]
-    fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new], settings)
+    fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, left.scores)) for w in new])
     fits |= {c.key: c for c in fitted}
     members, shift_lists, families = [], [], []
     for name, without in zip(best.effects, fewer, strict=True):
@@ -193,7 +191,7 @@ def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ..
         column = fit.jacobian[: after.linear.readings, space.free + best.active.index(name), None]
         ammeter = ammeter_families(space, remove_effect(space, best, name, fit), column, family, settings)
         families.append(tuple(dict.fromkeys((*(space.library[m].family() for m in same), *ammeter))))
-        shifts = find_prior_shifts(space, without, SURE * gain, settings, left.linear if one else None)
+        shifts = find_prior_shifts(space, without, SURE * gain, left.linear if one else None)
         shift_lists.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
     return Classes(tuple(members), tuple(shift_lists), tuple(families), (*ladder, *fitted))
 

@@ -193,9 +193,7 @@ def trace_known_readings(given: loop_input.LoopInput) -> verdict.LoopStages | No
         return None
     space = shared_stages.screened.base.space
     equations = space.with_noise(given.noise.sd, space.weight)
-    confirm = (
-        functools.partial(log_stages.smallest_confirmed, run.space, given.settings) if given.known_room else None
-    )
+    confirm = functools.partial(log_stages.smallest_confirmed, run.space) if given.known_room else None
     traced = trace_verdict(dataclasses.replace(given, equations=equations, known=None, confirm=confirm))
     refuted = run.contradicts and traced.verdict != "none"
     return dataclasses.replace(traced, verdict="place") if refuted else traced
@@ -208,7 +206,7 @@ def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate
     if (windows := log_stages.windows_of_log(given)) is None:
         return None
     space = given.space.with_room(given.known_room)
-    confirm = functools.partial(log_stages.best_simulated_size, space, given.settings)
+    confirm = functools.partial(log_stages.best_simulated_size, space)
     simulates = given.known is None or given.known_room
     windows = dataclasses.replace(windows, keep=given.kept_apart("windows"), confirm=confirm if simulates else None)
     traced = trace_verdict(windows)

@@ -232,7 +232,7 @@ def _predict_alternatives(
     return jax.vmap(predict_alternative)(which, z, informed)
 
 
-def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
+def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate]) -> PredictedReadings:
     """Predicted readings of the menu for these alternatives. The instruments are as accurate as those of the table.
 
     The menu holds the experiments within reach of the table that every alternative robot can do, without forbidden
@@ -259,12 +259,12 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     predictions, half = jax.tree.map(
         lambda x: np.asarray(x)[: len(names)], _predict_alternatives(equipped, other, batch, active, z, informed)
     )
-    experiments, possible = _possible_experiments(menu_experiments, predictions, settings)
+    experiments, possible = _possible_experiments(menu_experiments, predictions, space.settings)
     medians = np.median(space.equipped.data.sd, 0)
     sd = predicted.reading_sds(experiments, dict(zip(shown, medians, strict=True)))
     value, half = (np.nan_to_num(x[:, possible]) for x in (predictions.value, half))
     exists = np.all(predictions.exists[:, possible], 0)
-    return PredictedReadings(tuple(names), experiments, value, half, sd, exists, settings)
+    return PredictedReadings(tuple(names), experiments, value, half, sd, exists, space.settings)
 
 
 def _possible_experiments(
@@ -385,7 +385,7 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
     return Proposal((name,), instruction, (curve,), sigma)
 
 
-def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
+def propose_separating(space: CandidateSpace, best: Candidate, found: Classes) -> Proposal | None:
     """Experiment that separates the alternatives of a class. None if each effect has only one candidate name."""
     alternatives = alternatives_of_class(best, found)
-    return choose_experiment(predict_menu(space, alternatives, settings)) if len(alternatives) > 1 else None
+    return choose_experiment(predict_menu(space, alternatives)) if len(alternatives) > 1 else None

@@ -20,7 +20,6 @@ from calibration.discovery.formula import Proposal
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.score_tests import ScoreTable
-from calibration.discovery.settings import Settings
 from calibration.inference import bases, linearization
 from calibration.inference.estimates import SIDE_OF_BOUND
 from calibration.inference.identifiability import held_by_prior
@@ -115,7 +114,6 @@ def found_effects(
     best: Candidate,
     found: classes.Classes,
     test: adequacy.AdequacyTest,
-    settings: Settings,
 ) -> tuple[FoundEffect, ...]:
     """Result entry of each effect of the best candidate: its class, its parameters and its evidence.
 
@@ -123,7 +121,7 @@ def found_effects(
         test: adequacy test of the base fit. Its bootstrap gives the p-values.
     """
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
-    others = [base] if len(best.effects) == 1 else search.refit_without_each(space, best, settings, found.ladder)
+    others = [base] if len(best.effects) == 1 else search.refit_without_each(space, best, found.ladder)
     null, excess = np.asarray(test.null.single), candidates.excess_misfit(space, base)
     effects, fits = [], {c.key: c for c in reversed((best, *found.ladder))}
 
@@ -151,7 +149,7 @@ def found_effects(
                 unit=BALANCES[effect.balance][0],
                 equation=" ".join(equation.split()),
                 source=" ".join(source.split()),
-                parameters=_effect_parameters(space, best, slot, settings),
+                parameters=_effect_parameters(space, best, slot),
                 p_value=search.single_p_value(gain, null),
                 score=gain,
                 share=candidates.share_of_excess(excess, gain),
@@ -160,17 +158,15 @@ def found_effects(
     return tuple(effects)
 
 
-def _effect_parameters(
-    space: CandidateSpace, best: Candidate, slot: int, settings: Settings
-) -> dict[str, ParameterEstimate]:
+def _effect_parameters(space: CandidateSpace, best: Candidate, slot: int) -> dict[str, ParameterEstimate]:
     effect, k = space.library[best.active[slot]], space.free + slot
     amplitude, unit = linearization.amplitude_of(effect), amplitude_unit(effect)
-    fitted = float(best.amplitude[slot] * unit), float(settings.width * best.sd[k] * unit)
+    fitted = float(best.amplitude[slot] * unit), float(space.settings.width * best.sd[k] * unit)
     held_names = held_by_prior(best.sd)
     values = {amplitude.name: ParameterEstimate(*fitted, amplitude.spec.unit, bool(held_names[k]))}
     shape = linearization.free_shape_parameter(effect)
     if shape is not None:
-        k += settings.slots
+        k += space.settings.slots
         value, slope = _shaped(linearization.shape_scales(shape), best.z[k])
         fitted = float(value), float(slope) * float(best.sd[k])
         values[shape.name] = ParameterEstimate(*fitted, shape.spec.unit, bool(held_names[k]))
@@ -263,7 +259,7 @@ class RejectedCandidate:
 
 
 def listed_alternatives(
-    space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
+    space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate]
 ) -> tuple[tuple[RejectedCandidate, ...], tuple[RejectedCandidate, ...]]:
     """Candidates that explain the data nearly as well as the proposal, and separately those of implausible
     size.
@@ -279,17 +275,17 @@ def listed_alternatives(
     simpler = {best.key: cost} if best.key else {}
     for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
-        if c.key in simpler or not c.effects or rise > settings.alternative:
+        if c.key in simpler or not c.effects or rise > space.settings.alternative:
             continue
-        if any(key < c.key and 2 * (x - c.cost) < settings.alternative for key, x in simpler.items()):
+        if any(key < c.key and 2 * (x - c.cost) < space.settings.alternative for key, x in simpler.items()):
             continue
         simpler[c.key] = c.cost
-        near[c.plausible].append(_alternative(space, c, rise, settings))
+        near[c.plausible].append(_alternative(space, c, rise))
     plausible, ruled_out = (tuple(sorted(near[x], key=lambda a: a.rise_chi2)) for x in (True, False))
     return plausible, ruled_out
 
 
-def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> RejectedCandidate:
+def _alternative(space: CandidateSpace, c: Candidate, rise: float) -> RejectedCandidate:
     amplitudes, sds, sizes, why = {}, {}, {}, list[RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
@@ -297,7 +293,7 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
         effect = space.library[name]
         sds[name], sizes[name] = float(amplitude), float(size)
         amplitudes[name] = float(amplitude) * amplitude_unit(effect)
-        sd = settings.width * float(c.sd[space.free + slot])
+        sd = space.settings.width * float(c.sd[space.free + slot])
         if name in c.supplying:
             why.append(RuledOut(name, "power"))
         elif size >= 1:
@@ -398,7 +394,7 @@ class EffectScore:
     supplies: bool = False
 
 
-def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
+def effect_scores(space: CandidateSpace, scores: ScoreTable) -> tuple[EffectScore, ...]:
     """Score of each effect at its best shape and a plausible amplitude, strongest first. Equal scores are sorted by
     name.
     """
@@ -407,8 +403,8 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
         m = space.library.best_instance(effect.name, np.asarray(scores.single))
         best_amplitude, sigmas, unit = float(scores.amplitude[m]), float(scores.left[m]), amplitude_unit(effect)
         spec = linearization.amplitude_of(effect).spec
-        low = max(-settings.plausible, spec.bounds[0] / unit)
-        amplitude = min(max(best_amplitude, low), settings.plausible)
+        low = max(-space.settings.plausible, spec.bounds[0] / unit)
+        amplitude = min(max(best_amplitude, low), space.settings.plausible)
         explained = float(scores.single[m] ** 2 - ((best_amplitude - amplitude) * sigmas) ** 2)
         score_list.append(
             EffectScore(
@@ -453,42 +449,40 @@ class EffectRanking:
         return [e for e in self.effects if e.score > self.chance and not e.supplies]
 
 
-def rank_library(space: CandidateSpace, left: adequacy.Diagnosis, settings: Settings) -> EffectRanking:
+def rank_library(space: CandidateSpace, left: adequacy.Diagnosis) -> EffectRanking:
     """Ranking of the library by the share of the base's misfit that each effect alone would explain."""
     test = left.test
-    ranking = _rank_effects(space, left.scores, settings)
+    ranking = _rank_effects(space, left.scores)
     return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, ranking)
 
 
-def rank_effects_by_weak_form(
-    space: CandidateSpace, known: search.WeakFormScreening, settings: Settings
-) -> EffectRanking:
+def rank_effects_by_weak_form(space: CandidateSpace, known: search.WeakFormScreening) -> EffectRanking:
     """Ranking of the effects by the equations of a log in weak form, before any simulation."""
     p = search.single_p_value(float(np.max(known.scores.single**2)), known.null)
-    chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
-    ranking = _rank_effects(space, known.scores, settings)
+    chance = float(np.quantile(known.null, 1 - space.settings.family_wise_error, method="higher")) ** 2
+    ranking = _rank_effects(space, known.scores)
     shifts = parameter_shifts(space, known.base.z, known.base.z, known.base.sd)
     parameters = {name: (shift.after, shift.sd_after) for name, shift in shifts.items()}
-    return EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
+    return EffectRanking(p <= space.settings.family_wise_error, p, chance, ranking, known.windows, parameters)
 
 
-def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
+def _rank_effects(space: CandidateSpace, scores: ScoreTable) -> tuple[EffectScore, ...]:
     """Effects sorted by score. Effects that would supply power come last."""
-    return tuple(sorted(effect_scores(space, scores, settings), key=lambda e: e.supplies))
+    return tuple(sorted(effect_scores(space, scores), key=lambda e: e.supplies))
 
 
-def invisible_effects(
-    space: CandidateSpace, scores: ScoreTable, by_effect: Sequence[EffectScore], settings: Settings
-) -> Names:
+def invisible_effects(space: CandidateSpace, scores: ScoreTable, by_effect: Sequence[EffectScore]) -> Names:
     """Effects that the data cannot reveal, because even their largest plausible amplitude hardly changes the
     readings.
 
     Args:
         by_effect: result of `effect_scores`.
     """
-    weak = {s.name for s in by_effect if s.score < settings.visible**2}
+    weak = {s.name for s in by_effect if s.score < space.settings.visible**2}
     largest = zip(space.library.names, space.library.largest(np.asarray(scores.left)), strict=True)
-    return tuple(name for name, x in largest if settings.plausible * x < settings.visible and name in weak)
+    return tuple(
+        name for name, x in largest if space.settings.plausible * x < space.settings.visible and name in weak
+    )
 
 
 #: Rise of the objective up to which a joint fit is as good [σ²], and largest number of reported effects.
@@ -512,7 +506,7 @@ class HiddenEffect:
 
 
 def find_hidden_effects(
-    space: CandidateSpace, named: Names, left: ScoreTable, after: ScoreTable, settings: Settings
+    space: CandidateSpace, named: Names, left: ScoreTable, after: ScoreTable
 ) -> tuple[HiddenEffect, ...]:
     """Effects that may be present in addition to the named ones, which would hide them, the largest first.
 
@@ -530,11 +524,11 @@ def find_hidden_effects(
         if effect.name in named or beside <= 0 or alone <= 0:
             continue
         centre, spread = float(after.amplitude[m]), np.sqrt(SAME) / beside
-        ends = np.clip([centre - spread, centre + spread], -settings.plausible, settings.plausible)
+        ends = np.clip([centre - spread, centre + spread], -space.settings.plausible, space.settings.plausible)
         if effect.dissipative:
             ends = np.maximum(ends, 0.0)
         size = float(ends[np.argmax(np.abs(ends))])
-        if abs(size) * alone >= settings.needed and abs(size) * beside <= 2 * np.sqrt(SAME):
+        if abs(size) * alone >= space.settings.needed and abs(size) * beside <= 2 * np.sqrt(SAME):
             unit = linearization.amplitude_of(effect).spec.unit
             hidden.append(HiddenEffect(effect.name, size * amplitude_unit(effect), unit, abs(size) * alone))
     return tuple(sorted(hidden, key=lambda h: -h.sigmas)[:MOST])

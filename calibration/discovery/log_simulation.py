@@ -15,7 +15,6 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit
-from calibration.discovery.settings import Settings
 from calibration.inference.blocks import fit_from_each_start
 from calibration.inference.lack_of_fit import variance_of_sums
 from calibration.inference.observers.time_histories import HistoriesLinearization
@@ -100,9 +99,7 @@ def with_misfit(space: CandidateSpace, fit: Candidate) -> CandidateSpace:
 _memory = functools.partial(compiled, options=SELDOM)(HistoriesLinearization.memory)
 
 
-def refine_by_simulation(
-    space: CandidateSpace, fitted: Candidate, starts: Sequence[np.ndarray], settings: Settings
-) -> Candidate:
+def refine_by_simulation(space: CandidateSpace, fitted: Candidate, starts: Sequence[np.ndarray]) -> Candidate:
     """Best of the simulated fits of a set of effects from these starts, each after a few steps."""
     problem, _, active = space.fit_of(fitted.active, fitted.z)
     size, fits = len(problem.coordinates), list[Candidate]()
@@ -112,7 +109,7 @@ def refine_by_simulation(
         optimum = jax.tree.map(lambda x: x[0], optima)
         more = len(fitted.z) - size
         z, sd = np.pad(optimum.z, (0, more)), np.pad(optimum.sd, (0, more), constant_values=1.0)
-        fits.append(candidate_of_fit(space, fitted.active, dataclasses.replace(optimum, z=z, sd=sd), settings))
+        fits.append(candidate_of_fit(space, fitted.active, dataclasses.replace(optimum, z=z, sd=sd)))
     return min(fits, key=lambda x: x.cost)
 
 
@@ -120,7 +117,6 @@ def simulate_models(
     space: CandidateSpace,
     base: Candidate,
     best: Candidate,
-    settings: Settings,
     known: Candidate | None = None,
     disturbed: bool = False,
 ) -> LogSimulation:
@@ -132,11 +128,11 @@ def simulate_models(
     """
     space = space.with_room([*space.room, *best.effects])
     starts = [] if known is None else [known.z]
-    last = refine_by_simulation(space, best, [best.z, *(starts if best is base else [])], settings)
+    last = refine_by_simulation(space, best, [best.z, *(starts if best is base else [])])
     noisy = with_misfit(space, last) if disturbed else space
     disturbed = noisy is not space
     if disturbed:
-        space, last = noisy, refine_by_simulation(noisy, last, [last.z], settings)
+        space, last = noisy, refine_by_simulation(noisy, last, [last.z])
     without = np.where(np.arange(len(last.z)) < space.free, last.z, 0.0)
-    first = last if best is base else refine_by_simulation(space, base, [base.z, without, *starts], settings)
+    first = last if best is base else refine_by_simulation(space, base, [base.z, without, *starts])
     return LogSimulation(space, first, last, disturbed, 1 - best.cost / base.cost, 1 - last.cost / first.cost)

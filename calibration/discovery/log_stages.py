@@ -19,7 +19,7 @@ from calibration.discovery.loop_notes import MissedChannel
 from calibration.discovery.mechanism import find_mechanism
 from calibration.discovery.outliers import Screening
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate
-from calibration.discovery.settings import Settings, settings_for
+from calibration.discovery.settings import settings_for
 from calibration.discovery.verdict import LoopStages
 from calibration.inference import observers
 from calibration.inference.fit_notes import progress_remark
@@ -70,12 +70,13 @@ def windows_of_log(given: LoopInput) -> LoopInput | None:
 
     settings = given.settings
     posed, rows = problem_of_windows(bare, fit, space.library.scored, columns, settings.width)
-    table = active_set.candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
-    noise = dataclasses.replace(given.noise, sd=sd[rows])
     shares = settings_for(type(posed.observe), settings.replicates).shares
+    settings = dataclasses.replace(settings, shares=shares)
+    table = active_set.candidate_space(posed, space.library.effects, given.library, settings)
+    noise = dataclasses.replace(given.noise, sd=sd[rows])
     return dataclasses.replace(
         given, runs=runs.where(rows), numbers=numbers[rows], noise=noise, equations=table, known=None,
-        settings=dataclasses.replace(settings, shares=shares),
+        settings=settings,
     )  # fmt: skip
 
 
@@ -92,16 +93,14 @@ def readings_of_log(given: LoopInput, screened: Screening, sds: verdict.VerdictN
     problem = space.with_noise(None, weight).bare
     z = screened.base.candidate.z[: space.free]
     posed = problem_of_readings(problem, z, space.library.scored, settings.width)
-    equations = active_set.candidate_space(
-        posed, space.library.effects, given.library, settings.slots, settings.width
-    )
+    equations = active_set.candidate_space(posed, space.library.effects, given.library, settings)
     apart = given.kept_apart("readings")
 
     def keep(name: str, make: Callable[[], Any]) -> Any:
         """Stores a stage apart, except a second ranking."""
         return None if ranked and name == "ranking" else apart(name, make)
 
-    confirm = functools.partial(smallest_confirmed, space, settings)
+    confirm = functools.partial(smallest_confirmed, space)
     return dataclasses.replace(
         given, equations=equations, noise=sds.noise, known=None, keep=keep, confirm=confirm
     )  # fmt: skip
@@ -117,7 +116,6 @@ def confirm_readings(
         screened, sds: simulated fit of the base, and its noise.
         traced: results of these stages.
     """
-    settings = given.settings
     if not traced.sds.factors:
         traced = dataclasses.replace(
             traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks)
@@ -127,7 +125,7 @@ def confirm_readings(
     given.progress(progress_remark("confirm"))
     best = _chosen_fit(traced)
     space = space if traced.searched is None else space.with_room(traced.searched.room)
-    run = simulate_models(space, linear.candidate, best, settings, screened.base.candidate)
+    run = simulate_models(space, linear.candidate, best, screened.base.candidate)
     traced = dataclasses.replace(traced, run=run)
     if traced.searched is None:
         return traced
@@ -140,7 +138,7 @@ def confirm_readings(
 
 
 def smallest_confirmed(
-    space: active_set.CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis,
+    space: active_set.CandidateSpace, screened: Screening, left: Diagnosis,
     searched: SearchResult, noise: Noise,
 ) -> SearchResult:  # fmt: skip
     """The search with the smallest set whose simulation leaves no discrepancy, or else the largest set.
@@ -166,7 +164,7 @@ def smallest_confirmed(
     space = space.with_noise(noise.sd, screened.base.space.weight)
     space = space.with_room([*space.room, *(name for sets in sizes for c in sets for name in c.effects)])
     for sets in filter(None, sizes):
-        fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
+        fits = [refine_by_simulation(space, c, [c.z]) for c in sets]
         k = min(range(len(fits)), key=lambda k: fits[k].cost)
         diagnosis = diagnose_candidate(space, fits[k], screened.bases, left, left.linear)
         searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
@@ -181,7 +179,7 @@ def _has_room(space: active_set.CandidateSpace, fit: Candidate) -> bool:
 
 
 def best_simulated_size(
-    space: active_set.CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis,
+    space: active_set.CandidateSpace, screened: Screening, left: Diagnosis,
     searched: SearchResult, noise: Noise,
 ) -> SearchResult:  # fmt: skip
     """The search in the windows of a log with the largest set that lowers the misfit of a simulation.
@@ -195,7 +193,7 @@ def best_simulated_size(
     searched = dataclasses.replace(searched, room=space.room)
     if len(sets) < 2:
         return searched
-    costs = [refine_by_simulation(space, c, [c.z], settings).cost for c in sets]
+    costs = [refine_by_simulation(space, c, [c.z]).cost for c in sets]
     best = sets[int(np.argmin(costs))]
     if best is searched.best:
         return searched
@@ -266,7 +264,7 @@ def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) ->
     given.progress(progress_remark("confirm"))
     reading_fit, base = _chosen_fit(traced), delayed_by_rows(given, screened.base.candidate)
     best = base if reading_fit is screened.base.candidate else delayed_by_rows(given, reading_fit)
-    run = simulate_models(given.space.with_room(searched.room), base, best, given.settings, disturbed=True)
+    run = simulate_models(given.space.with_room(searched.room), base, best, disturbed=True)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
     if not confirmed.rejected or (not run.disturbed and excess_misfit(run.space, run.base) < noise):

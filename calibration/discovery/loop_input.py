@@ -204,5 +204,5 @@ def build_candidate_space(
     coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose_problem(runs.where(index), robot, coordinates, sd[index])
     visible = scales.visible_effects(library, robot, kind, scales.goes_both_ways(runs), scales.has_partial_duty(runs))
-    space = active_set.candidate_space(bare, visible, library, settings.slots, settings.width)
+    space = active_set.candidate_space(bare, visible, library, settings)
     return space.without(~real)

@@ -163,14 +163,14 @@ class Screening:
 
 
 @contextlib.contextmanager
-def compile_ahead(space: CandidateSpace, runs: Runs, settings: Settings) -> Iterator[Callable[[BaseFit], None]]:
+def compile_ahead(space: CandidateSpace, runs: Runs) -> Iterator[Callable[[BaseFit], None]]:
     """Context manager that compiles programs for later steps, on other cores, during the base fit.
 
     To compile them, it runs a diagnosis and, except for long runs, one bootstrap replicate and a fit with slots, all
     at the prior mean. It yields a function of the base fit that does the same for the predictions of experiments. All
     results are discarded.
     """
-    nothing, none = np.zeros(len(space.coordinates)), fill_slots((), settings)
+    nothing, none = np.zeros(len(space.coordinates)), fill_slots((), space.settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
 
@@ -178,12 +178,12 @@ def compile_ahead(space: CandidateSpace, runs: Runs, settings: Settings) -> Iter
 
     def compile_diagnosis() -> None:
         try:
-            bases, (linear, _, _) = _diagnose_base(start, runs, settings)
+            bases, (linear, _, _) = _diagnose_base(start, runs, space.settings)
         finally:
             looked.set()
         if not space.bare.observe.long:
             bootstrap_statistics(
-                space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed
+                space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, space.settings.seed
             )
 
     def compile_fit() -> None:
@@ -194,7 +194,7 @@ def compile_ahead(space: CandidateSpace, runs: Runs, settings: Settings) -> Iter
 
     def compile_predictions(base: BaseFit) -> None:
         if space.bare.observe.menu:
-            jobs.append(others.submit(predict_menu, base.space, {"": base.candidate}, settings))
+            jobs.append(others.submit(predict_menu, base.space, {"": base.candidate}, space.settings))
 
     with Threads(2) as others:
         jobs: list[concurrent.futures.Future[Any]] = [others.submit(compile_diagnosis), others.submit(compile_fit)]
@@ -277,7 +277,7 @@ def _diagnose_base(base: BaseFit, runs: Runs, settings: Settings) -> tuple[Bases
 
 
 def _refit_without(base: BaseFit, rows: np.ndarray, settings: Settings, where: str) -> BaseFit:
-    again = fit_base(base.space.without(rows), settings, where, base.candidate)
+    again = fit_base(base.space.without(rows), where, base.candidate)
     return dataclasses.replace(again, unusable=tuple(sorted({*base.unusable, *again.unusable})))
 
 

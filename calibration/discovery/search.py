@@ -28,7 +28,6 @@ from calibration.discovery.candidates import (
 )
 from calibration.discovery.projection import ABSORBED
 from calibration.discovery.score_tests import ScoreTable, diagnose_fit
-from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.linearization import Linearization
@@ -76,7 +75,6 @@ def search_effects(
     base: Candidate,
     left: Diagnosis,
     bases: Bases,
-    settings: Settings,
     progress: Callable[[Remark], None],
 ) -> SearchResult:
     """Smallest set of effects that explains the discrepancy of the base to within the margin of the test.
@@ -86,31 +84,31 @@ def search_effects(
         left: diagnosis of that fit.
     """
     names = _names_by_score(space, left.scores)[: space.bare.observe.policy.batch]
-    ladder = fit_in_addition(space, [(fill_slots([name], settings), base, left.scores) for name in names], settings)
+    ladder = fit_in_addition(space, [(fill_slots([name], space.settings), base, left.scores) for name in names])
     null = np.asarray(left.test.null.single)
     best, diagnosis, diagnosed = _best_plausible(ladder), None, None
-    if best is not None and single_p_value(2 * (base.cost - best.cost), null) > settings.family_wise_error:
+    if best is not None and single_p_value(2 * (base.cost - best.cost), null) > space.settings.family_wise_error:
         best = None
     while best is not None:
         diagnosed = best
         diagnosis = diagnose_candidate(space, best, bases, left)
         if not diagnosis.test.rejected_with_margin or len(best.effects) == int(
-            min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect))
+            min(space.settings.slots, max(1, space.included.sum() // space.settings.rows_per_effect))
         ):
             break
         progress(progress_remark("more effects", best.effects))
-        more = _extend_set(space, best, diagnosis, base, left, settings)
+        more = _extend_set(space, best, diagnosis, base, left)
         # It has to explain clearly more than every candidate with one effect fewer.
         fewer_costs = [c.cost for c in ladder if c.plausible and len(c.effects) == len(best.effects)]
         best = _best_plausible(more)
-        if best is not None and not 2 * (min(fewer_costs, default=np.inf) - best.cost) >= settings.needed**2:
+        if best is not None and not 2 * (min(fewer_costs, default=np.inf) - best.cost) >= space.settings.needed**2:
             best = None
         ladder += more
         if best is not None:
-            fewer = refit_without_each(space, best, settings)
+            fewer = refit_without_each(space, best)
             ladder += fewer
             gains = [2 * (c.cost - best.cost) for c in fewer]
-            if any(single_p_value(gain, null) > settings.family_wise_error for gain in gains):
+            if any(single_p_value(gain, null) > space.settings.family_wise_error for gain in gains):
                 best = None
     return SearchResult(tuple(ladder), diagnosed, diagnosis)
 
@@ -136,18 +134,16 @@ def single_p_value(gain: float, null: np.ndarray) -> float:
     return (1 + int(np.sum(null**2 >= gain))) / (1 + len(null))
 
 
-def refit_without_each(
-    space: CandidateSpace, best: Candidate, settings: Settings, ladder: Sequence[Candidate] = ()
-) -> list[Candidate]:
+def refit_without_each(space: CandidateSpace, best: Candidate, ladder: Sequence[Candidate] = ()) -> list[Candidate]:
     """Refits a candidate without each of its effects in turn. The remaining effects are in the first slots.
 
     Args:
         ladder: fits that are already known.
     """
-    fewer = [fill_slots([n for n in best.effects if n != name], settings) for name in best.effects]
+    fewer = [fill_slots([n for n in best.effects if n != name], space.settings) for name in best.effects]
     fits = {c.active: c for c in ladder}
-    new = [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in fits]
-    fits |= {c.active: c for c in fit_candidates(space, new, settings)}
+    new = [(w, start_of_fit(space, best, w)) for w in fewer if w not in fits]
+    fits |= {c.active: c for c in fit_candidates(space, new)}
     return [fits[w] for w in fewer]
 
 
@@ -164,22 +160,21 @@ def _extend_set(
     left_by_best: Diagnosis,
     base: Candidate,
     left: Diagnosis,
-    settings: Settings,
 ) -> list[Candidate]:
     """Fits the best set with one more effect and, if the best is the base, also pairs of effects."""
     batch = space.bare.observe.policy.batch
     names = _names_by_score(space, left_by_best.scores, best.effects)[:batch]
-    sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
+    sources = {fill_slots([*best.effects, name], space.settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
         pair_scores = np.triu(left.scores.pair)
         strongest = np.unravel_index(np.argsort(-pair_scores, axis=None)[:PAIRS], pair_scores.shape)
         pairs = dict.fromkeys(tuple(sorted(pair)) for pair in space.library.of[np.stack(strongest, 1)].tolist())
         for i, j in itertools.islice((pair for pair in pairs if pair[0] != pair[1]), batch):
             pair = space.library.names[i], space.library.names[j]
-            if not {fill_slots(pair, settings), fill_slots(pair[::-1], settings)} & sources.keys():
-                sources[fill_slots(pair, settings)] = base, left
+            if not {fill_slots(pair, space.settings), fill_slots(pair[::-1], space.settings)} & sources.keys():
+                sources[fill_slots(pair, space.settings)] = base, left
     extensions = [(active, fit, ranking.scores) for active, (fit, ranking) in sources.items()]
-    return fit_in_addition(space, extensions, settings)
+    return fit_in_addition(space, extensions)
 
 
 def _best_plausible(candidates: Sequence[Candidate]) -> Candidate | None:
@@ -212,7 +207,7 @@ class WeakFormScreening:
     null: np.ndarray
 
 
-def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormScreening | None:
+def screen_by_weak_form(space: CandidateSpace) -> WeakFormScreening | None:
     """Fits base parameters and effects by regression on a log's equations in weak form. None if the log does not show
     its states (`fit_weak_form`).
 
@@ -235,12 +230,12 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormSc
     amplitude = np.where(is_visible, single / np.where(is_visible, norm, 1.0), 0.0)
     parts: tuple[Any, ...] = (single, amplitude, norm, none, ways.T @ ways, *[none] * 4)
     scores = ScoreTable(*parts)
-    random = np.random.default_rng(settings.seed)
-    null = np.max(np.abs(random.standard_normal((settings.replicates, len(ways))) @ ways), 1)
+    random = np.random.default_rng(space.settings.seed)
+    null = np.max(np.abs(random.standard_normal((space.settings.replicates, len(ways))) @ ways), 1)
     sd = np.sqrt(np.diag(np.linalg.inv(equations.jacobian.T @ equations.jacobian)))
     cost = np.asarray(0.5 * np.sum(equations.residual**2))
     of_fit: tuple[Any, ...] = (equations.z, sd, np.zeros((0, 0)), cost, np.zeros(()), np.asarray(True), np.asarray(0))
-    optimum = with_slots(Optimum(*of_fit), space, settings)
-    base = dataclasses.replace(candidate_of_fit(space, fill_slots((), settings), optimum, settings), simulated=False)
+    optimum = with_slots(Optimum(*of_fit), space)
+    base = dataclasses.replace(candidate_of_fit(space, fill_slots((), space.settings), optimum), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     return WeakFormScreening(base, slides, scores, len(equations.signatures), null)

@@ -71,18 +71,16 @@ def _fit_base(
     if before is None:
         if begin is not None:  # as near as a simulated fit, and its effects are ranked
             near = dataclasses.replace(begin, simulated=True)
-        elif (ranking := search.screen_by_weak_form(space, settings)) is not None:
-            make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, settings)
+        elif (ranking := search.screen_by_weak_form(space)) is not None:
+            make = functools.partial(findings.rank_effects_by_weak_form, space, ranking)
             if not given.shows_unmodelled_backlash:
                 given.ranked.append(given.keep("ranking", make))
             near = None if ranking.slides else ranking.base
         if given.others is not None:
-            given.later.append(given.others.enter_context(outliers.compile_ahead(space, given.runs, settings)))
+            given.later.append(given.others.enter_context(outliers.compile_ahead(space, given.runs)))
     if given.equations is None or not space.bare.observe.reads:  # linear readings have a fit
         given.progress(progress_remark("base"))
-    return outliers.screen_outliers(
-        candidates.fit_base(space, settings, given.runs.source, near), given.runs, settings
-    )
+    return outliers.screen_outliers(candidates.fit_base(space, given.runs.source, near), given.runs, settings)
 
 
 def search_until_clean(
@@ -105,13 +103,13 @@ def search_until_clean(
 
     def search_effects(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, SearchResult]:
         space, base = screened.base.space, screened.base.candidate
-        return screened, left, search.search_effects(space, base, left, screened.bases, settings, progress)
+        return screened, left, search.search_effects(space, base, left, screened.bases, progress)
 
     for k in range(SCREENINGS):
         progress(progress_remark("bootstrap", settings.replicates))
         screened, diagnosis = keep(f"bootstrap {k}", functools.partial(test_base, screened))
         if k == 0 and not given.ranked and not given.shows_unmodelled_backlash:
-            keep("ranking", functools.partial(findings.rank_library, screened.base.space, diagnosis, settings))
+            keep("ranking", functools.partial(findings.rank_library, screened.base.space, diagnosis))
         if given.shows_unmodelled_backlash or (not diagnosis.test.rejected and screened.cluster is None):
             return screened, diagnosis, None  # effects of the library would only stand in for a backlash
         progress(progress_remark("effects"))
@@ -227,7 +225,7 @@ def choose_effects(
     fit = next((c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)), None)
     if fit is None:
         active = candidates.fill_slots(names, settings)
-        begins = candidates.start_of_fit(space, proposed[0], active, settings, beside.left.scores)
-        (fit,) = candidates.fit_candidates(space, [(active, begins)], settings)
+        begins = candidates.start_of_fit(space, proposed[0], active, beside.left.scores)
+        (fit,) = candidates.fit_candidates(space, [(active, begins)])
         searched = dataclasses.replace(searched, ladder=(*searched.ladder, fit))
     return proposed if fit is proposed[0] else diagnosed(fit), searched, stood

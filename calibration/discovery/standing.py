@@ -262,8 +262,8 @@ def judge_each_name(
     over_time = space.bare.observe.over_time
     most = searched.diagnosis or after
     lacks = _deficient_equations(space, most, bases)
-    fewer = dict(zip(largest.effects, refit_without_each(space, largest, settings, searched.ladder), strict=True))
-    without_effect = refit_without_each(space, best, settings, searched.ladder)
+    fewer = dict(zip(largest.effects, refit_without_each(space, largest, searched.ladder), strict=True))
+    without_effect = refit_without_each(space, best, searched.ladder)
     fits = {c.active: c for c in (*without_effect, *(c for e, c in fewer.items() if e in best.effects))}
     linearizations = {active: diagnose_candidate(space, c, bases, after).linear for active, c in fits.items()}
     for effect, without in zip(best.effects, without_effect, strict=True):
