@@ -194,7 +194,7 @@ def compile_ahead(space: CandidateSpace, runs: Runs) -> Iterator[Callable[[BaseF
 
     def compile_predictions(base: BaseFit) -> None:
         if space.bare.observe.menu:
-            jobs.append(others.submit(predict_menu, base.space, {"": base.candidate}, space.settings))
+            jobs.append(others.submit(predict_menu, base.space, {"": base.candidate}))
 
     with Threads(2) as others:
         jobs: list[concurrent.futures.Future[Any]] = [others.submit(compile_diagnosis), others.submit(compile_fit)]
