@@ -155,7 +155,7 @@ def work(task: Task) -> dict:
         line |= after(case, given.runs, found)
     if kind == "library" and found.verdict == "class" and case.toml is None and not task.brief:
         try:
-            line["experiments"] = carried_out(case, found, given.settings)
+            line["experiments"] = carried_out(case, found)
         except Exception as error:  # an unknown menu loses a figure, not the table
             line["experiments"], line["experiments_error"] = [], f"{type(error).__name__}: {error}"
     if kind == "coverage":
@@ -227,7 +227,7 @@ def after(case: Case, runs, found) -> dict:
     return {"held_out": [rms(x) for x in both], "bias": bias}
 
 
-def carried_out(case: Case, found, settings) -> list[dict]:
+def carried_out(case: Case, found) -> list[dict]:
     """Proposed experiments carried out in sequence, until one alternative or no proposal is left."""
     import loop_experiments
 

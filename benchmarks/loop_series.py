@@ -103,13 +103,13 @@ def work(task: Task) -> dict:
         return {"skipped": case}
     wide = not case.world.stated
     given, found, line = looped(case, task, {} if wide else STATED)
-    line["truth"] = [e | _left(found, e, given.settings) for e in line["truth"]]
+    line["truth"] = [e | _left(found, e) for e in line["truth"]]
     if task.kind in ("outside", "blind") and wide:
         line["truth"] = [{**t, **o} for t, o in zip(line["truth"], histories.oracle(case), strict=True)]
     return line | _amplitudes(found, given.settings)
 
 
-def _left(found, effect: dict, settings) -> dict:
+def _left(found, effect: dict) -> dict:
     """Remainder of a library effect after the loop's own base, which frees its base parameters at its own fit."""
     from calibration.discovery.findings import effect_scores
     from calibration.inference.linearization import amplitude_unit

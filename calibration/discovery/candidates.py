@@ -142,35 +142,27 @@ def fill_slots(effects: Sequence[str], settings: Settings) -> Names:
 
 def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum) -> Candidate:
     """Candidate with the result of a fit and the plausibility of its amplitudes."""
+    settings, filled = space.settings, np.array([bool(name) for name in active])
     amplitude, spread = (
-        np.where(
-            [bool(name) for name in active], space.settings.width * np.asarray(space.coordinates.parts(x)[1]), 0.0
-        )
-        for x in (best.z, best.sd)
+        np.where(filled, settings.width * np.asarray(space.coordinates.parts(x)[1]), 0.0) for x in (best.z, best.sd)
     )
-    size, near = (
-        np.array([_relative_amplitude(space, n, a) for n, a in zip(active, x, strict=True)])
-        for x in (amplitude, spread)
-    )
+
+    def relative_to_plausible(name: str, amplitude: float) -> float:
+        """Amplitude [prior sds] relative to the largest plausible one of its sign. 0 for an empty slot."""
+        if not name:
+            return 0.0
+        spec = amplitude_of(space.library[name]).spec
+        bound = max(spec.bounds[1] if amplitude > 0 else -spec.bounds[0], 0.0) / spec.prior_sd(0.0)
+        return abs(amplitude) / max(min(settings.plausible, bound), 1e-9)
+
+    size, near = (np.array(list(map(relative_to_plausible, active, x))) for x in (amplitude, spread))
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
     z, sd = np.asarray(best.z), np.asarray(best.sd)
     supplies = supplying_effects(space, active, amplitude, z) if np.isfinite(cost) else ()
     # An amplitude within an sd of a bound is held by it, unless its sd is as large as the whole plausible range.
     ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and not supplies
-    nearly = bool(np.all(size < space.settings.stretched)) and not supplies
+    nearly = bool(np.all(size < settings.stretched)) and not supplies
     return Candidate(active, z, sd, cost, amplitude, size, ok, nearly, bool(best.converged), supplies)
-
-
-def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float) -> float:
-    """Amplitude relative to the largest plausible one of its sign [-]. The amplitude is given in prior sds. 0 for an
-    empty slot.
-    """
-    if not name:
-        return 0.0
-    spec = amplitude_of(space.library[name]).spec
-    unit = spec.prior_sd(0.0)
-    bound = max(spec.bounds[1] if amplitude > 0 else -spec.bounds[0], 0.0) / unit
-    return abs(amplitude) / max(min(space.settings.plausible, bound), 1e-9)
 
 
 @dataclasses.dataclass(frozen=True)

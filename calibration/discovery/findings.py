@@ -11,14 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration import described
-from calibration.data import Names
-from calibration.discovery import adequacy, candidates, classes, projection, search
+from calibration.data import Json, Names, writing
+from calibration.discovery import adequacy, candidates, classes, loop_notes, projection, search
 from calibration.discovery.active_set import CandidateSpace, with_only
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.formula import Proposal
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.score_tests import ScoreTable
 from calibration.inference import bases, linearization
 from calibration.inference.estimates import SIDE_OF_BOUND
@@ -106,6 +105,25 @@ class FoundEffect:
     p_value: float
     score: float
     share: float
+
+    def to_json(self, support: loop_notes.NameSupport | None) -> Json:
+        """Entry of result.json. `support`: tests of the names."""
+        test = None if support is None else support.test_of(self.name)
+        form = test is not None and test.shows_form
+        return {
+            "name": self.name,
+            "class": [*self.members, *self.stated],
+            "standing": "established" if support is None or support.established(self.name) else "tentative",
+            "doubts": test.fails if test else [],
+            "rests_on_row": test and test.rests_on,
+            "root": test and test.root,
+            "root_needed": test and test.needed,
+            **writing.entries_of(
+                self, "families", "balance", "unit", "equation", "source", "parameters", "p_value", "score", "share"
+            ),
+            "accuracy_of_form": writing.entries_of(test, "over", "share=spread") if form else None,
+            **writing.entries_of(self, "members", "stated_values=stated"),
+        }
 
 
 def found_effects(
@@ -204,6 +222,24 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     defect: np.ndarray | None = None
     defect_sd: np.ndarray | None = None
 
+    def to_json(self) -> Json:
+        """Entry of result.json."""
+        return {
+            "name": "unnamed",
+            "class": [],
+            "families": (self.family,),
+            **writing.entries_of(
+                self, "balance", "channel", "balances_alike", "variable", "variables_alike", "window"
+            ),
+            "unit": self.unit,
+            "equation": None,
+            "parameters": {},
+            **writing.entries_of(self, "p_value", "score", "effect"),
+            "curve": writing.entries_of(self, "at", "value", "sd", "unit"),
+            "course": described.describe(self),
+            "proposal": self.proposal,
+        }
+
 
 def unnamed_discrepancy(
     beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int, simulated: bool
@@ -250,7 +286,7 @@ class RejectedCandidate:
     prior_sds: dict[str, float]
     sizes: dict[str, float]
     rise_chi2: float
-    reasons: tuple[RuledOut, ...] = ()
+    reasons: tuple[loop_notes.RuledOut, ...] = ()
 
     @property
     def why(self) -> str:
@@ -286,7 +322,7 @@ def listed_alternatives(
 
 
 def _alternative(space: CandidateSpace, c: Candidate, rise: float) -> RejectedCandidate:
-    amplitudes, sds, sizes, why = {}, {}, {}, list[RuledOut]()
+    amplitudes, sds, sizes, why = {}, {}, {}, list[loop_notes.RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
             continue
@@ -295,12 +331,12 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float) -> RejectedCa
         amplitudes[name] = float(amplitude) * amplitude_unit(effect)
         sd = space.settings.width * float(c.sd[space.free + slot])
         if name in c.supplying:
-            why.append(RuledOut(name, "power"))
+            why.append(loop_notes.RuledOut(name, "power"))
         elif size >= 1:
             check = effect.rests_on or (linearization.amplitude_of(effect).spec.meaning,)
-            why.append(RuledOut(name, "size", float(size), tuple(check)))
+            why.append(loop_notes.RuledOut(name, "size", float(size), tuple(check)))
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
-            why.append(RuledOut(name, "edge"))
+            why.append(loop_notes.RuledOut(name, "edge"))
     return RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
 
 

@@ -17,13 +17,11 @@ from scipy.special import ndtr, ndtri
 from calibration.data import Columns
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base
 from calibration.discovery.experiments import predict_menu
 from calibration.discovery.score_tests import (
     Diagnosed,
     ScoreTable,
-    StrongestStatistics,
     bootstrap_statistics,
     diagnose_fit,
 )
@@ -319,25 +317,3 @@ def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:
     columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
     observe = problem.observe.at_fit(problem, z)
     return observe.bases(columns, base.space.included, problem.robot(jnp.asarray(z)))
-
-
-def diagnose_base_by_bootstrap(
-    screened: Screening,
-    settings: Settings,
-    freedom: np.ndarray | None = None,
-    null: StrongestStatistics | None = None,
-) -> Diagnosis:
-    """Diagnosis of the base fit, tested against a bootstrap of this fit.
-
-    Args:
-        freedom: degrees of freedom of the sd of each channel.
-        null: statistics of the bootstrap replicates. None: they are computed here.
-    """
-    space, base = screened.base.space, screened.base.candidate
-    linear, scores, statistics = screened.diagnosed
-    if null is None:
-        null = bootstrap_statistics(
-            space.bare, base.z[: space.free], linear, space.library.scored, screened.bases, settings.replicates,
-            settings.seed, freedom,
-        )  # fmt: skip
-    return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))

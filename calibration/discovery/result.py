@@ -241,7 +241,7 @@ class DiscoveryResult:
         """The whole result as JSON data, as described in docs/schemas/loop.schema.json."""
         mechanism, main = self.summary.mechanism, next(iter(self.errors_held_out.values()), (None, None))
         as_stated, course = self.errors_as_stated, "" if self.unnamed is None else described.describe(self.unnamed)
-        unnamed = [] if self.unnamed is None else [_unnamed_json(self.unnamed, course)]
+        unnamed = [] if self.unnamed is None else [self.unnamed.to_json()]
         return writing.json_value(
             {
                 "schema": SCHEMA,
@@ -264,7 +264,7 @@ class DiscoveryResult:
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
                 **writing.entries_of(self, "rows_unusable=unusable", "rows_outliers=outliers"),
-                "effects": [*(_effect_json(e, self.support) for e in self.effects), *unnamed],
+                "effects": [*(e.to_json(self.support) for e in self.effects), *unnamed],
                 **writing.entries_of(
                     self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories", "needs_reverse"
                 ),
@@ -376,38 +376,3 @@ class NoiseVerdict:
     def to_json(self) -> Json:
         """Entry of result.json."""
         return writing.entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
-
-
-def _effect_json(e: findings.FoundEffect, support: loop_notes.NameSupport | None) -> Json:
-    test = None if support is None else support.test_of(e.name)
-    form = test is not None and test.shows_form
-    return {
-        "name": e.name,
-        "class": [*e.members, *e.stated],
-        "standing": "established" if support is None or support.established(e.name) else "tentative",
-        "doubts": test.fails if test else [],
-        "rests_on_row": test and test.rests_on,
-        "root": test and test.root,
-        "root_needed": test and test.needed,
-        **writing.entries_of(
-            e, "families", "balance", "unit", "equation", "source", "parameters", "p_value", "score", "share"
-        ),
-        "accuracy_of_form": writing.entries_of(test, "over", "share=spread") if form else None,
-        **writing.entries_of(e, "members", "stated_values=stated"),
-    }
-
-
-def _unnamed_json(d: findings.UnnamedDiscrepancy, course: str) -> Json:
-    return {
-        "name": "unnamed",
-        "class": [],
-        "families": (d.family,),
-        **writing.entries_of(d, "balance", "channel", "balances_alike", "variable", "variables_alike", "window"),
-        "unit": d.unit,
-        "equation": None,
-        "parameters": {},
-        **writing.entries_of(d, "p_value", "score", "effect"),
-        "curve": writing.entries_of(d, "at", "value", "sd", "unit"),
-        "course": course,
-        "proposal": d.proposal,
-    }

@@ -9,22 +9,22 @@ import itertools
 import numpy as np
 
 from calibration.discovery import (
+    adequacy,
     candidates,
     classes,
     discrepancy,
     findings,
     outliers,
     prediction,
+    score_tests,
     search,
     verdict,
 )
-from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import varied_by_duty
 from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.loop_notes import NameSupport
 from calibration.discovery.mechanism import find_mechanism
-from calibration.discovery.outliers import Screening
 from calibration.discovery.search import Proposed, SearchResult
 from calibration.discovery.standing import judge_names
 from calibration.discovery.verdict import LoopStages, VerdictNoise
@@ -39,7 +39,9 @@ SCREENINGS = 4
 LIKELY = 4.0
 
 
-def fit_base_and_noise(given: LoopInput, begin: candidates.Candidate | None) -> tuple[Screening, VerdictNoise]:
+def fit_base_and_noise(
+    given: LoopInput, begin: candidates.Candidate | None
+) -> tuple[outliers.Screening, VerdictNoise]:
     """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
     known_stages, noise = given.known, given.noise
     screened = _fit_base(given, noise, None if known_stages is None else known_stages.screened.base, begin)
@@ -59,7 +61,7 @@ def fit_base_and_noise(given: LoopInput, begin: candidates.Candidate | None) -> 
 
 def _fit_base(
     given: LoopInput, noise: Noise, before: candidates.BaseFit | None, begin: candidates.Candidate | None
-) -> Screening:
+) -> outliers.Screening:
     """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
     For logs, the equations in weak form give the start of the fit, and rank the library unless effects would only
@@ -84,24 +86,32 @@ def _fit_base(
 
 
 def search_until_clean(
-    given: LoopInput, screened: Screening, sds: VerdictNoise
-) -> tuple[Screening, Diagnosis, SearchResult | None]:
+    given: LoopInput, screened: outliers.Screening, sds: VerdictNoise
+) -> tuple[outliers.Screening, adequacy.Diagnosis, SearchResult | None]:
     """Searches for effects, again whenever new outliers appear. No search if the base fits, or if the log shows
     backlash that the robot lacks.
     """
     settings, keep, progress = given.settings, given.keep, given.progress
 
-    def test_base(screened: Screening) -> tuple[Screening, Diagnosis]:
+    def test_base(screened: outliers.Screening) -> tuple[outliers.Screening, adequacy.Diagnosis]:
         """Tests the base fit by bootstrap. If an effect is probably missing, also compiles later programs."""
-        known_stages, null = given.known, None
-        if known_stages is not None and np.all(known_stages.screened.base.space.weight == screened.base.space.weight):
-            null = known_stages.left.test.null
-        if np.max(np.abs(screened.diagnosed[1].single)) > LIKELY:
+        space, known_stages = screened.base.space, given.known
+        linear, scores, statistics = screened.diagnosed
+        if np.max(np.abs(scores.single)) > LIKELY:
             while given.later:
                 given.later.pop()(screened.base)
-        return screened, outliers.diagnose_base_by_bootstrap(screened, settings, sds.noise.freedom, null)
+        if known_stages is not None and np.all(known_stages.screened.base.space.weight == space.weight):
+            null = known_stages.left.test.null
+        else:
+            null = score_tests.bootstrap_statistics(
+                space.bare, screened.base.candidate.z[: space.free], linear, space.library.scored, screened.bases,
+                settings.replicates, settings.seed, sds.noise.freedom,
+            )  # fmt: skip
+        return screened, adequacy.Diagnosis(linear, scores, adequacy.AdequacyTest(statistics, null, settings))
 
-    def search_effects(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, SearchResult]:
+    def search_effects(
+        screened: outliers.Screening, left: adequacy.Diagnosis
+    ) -> tuple[outliers.Screening, adequacy.Diagnosis, SearchResult]:
         space, base = screened.base.space, screened.base.candidate
         return screened, left, search.search_effects(space, base, left, screened.bases, progress)
 
@@ -126,7 +136,11 @@ def search_until_clean(
 
 
 def reach_verdict(
-    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: SearchResult | None
+    given: LoopInput,
+    screened: outliers.Screening,
+    left: adequacy.Diagnosis,
+    sds: VerdictNoise,
+    searched: SearchResult | None,
 ) -> LoopStages:
     """Verdict on the base: effects, classes of effects, a mechanism or a place. Without a search, nothing is missing,
     or the model does not describe the runs.
