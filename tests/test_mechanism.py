@@ -77,10 +77,10 @@ def found(monkeypatch):
     monkeypatch.setattr(room, "_with_ammeter_families", lambda beside, found: found)
     monkeypatch.setattr(gains_room, "linear_gain_of_curve", lambda *_: Gain(1.0, 0.1))
     differs = [(None, "", 0.0)]
-    monkeypatch.setattr(room, "changed_run", lambda *_: differs[0])
+    monkeypatch.setattr(room.standing, "changed_run", lambda *_: differs[0])
     left = SimpleNamespace(linear=SimpleNamespace(jacobian=0.0, residual=0.0))
-    monkeypatch.setattr(room, "evidence_over_curves", lambda *_: 0.0)
-    monkeypatch.setattr(room, "recurrence_of_families", lambda *_: 1.0)
+    monkeypatch.setattr(room.standing, "evidence_over_curves", lambda *_: 0.0)
+    monkeypatch.setattr(room.standing, "recurrence_of_families", lambda *_: 1.0)
 
     def of(*ladder, curve, where=SPEED, long=False, reads=True, run=(None, "", 0.0)):
         space.bare.observe.long = space.bare.observe.over_time = long
@@ -155,7 +155,7 @@ def test_an_effect_that_a_curve_refutes_is_listed_with_the_drivers_of_curves(fou
     """As a saturated duty that imitates a bump of a loss torque over the speed."""
     effect = fitted("leads", explains=1880.0)
     assert found(effect, curve=1700.0).families == (FAMILIES["leads"],)
-    monkeypatch.setattr(room, "evidence_over_curves", lambda *_: -room.BETTER - 1)
+    monkeypatch.setattr(room.standing, "evidence_over_curves", lambda *_: -room.BETTER - 1)
     refuted = found(effect, curve=1700.0)
     assert refuted.families == (FAMILIES["leads"], SPEED.family) and refuted.effects == ("leads",)
 

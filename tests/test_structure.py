@@ -120,9 +120,6 @@ MORE_NAMES = {
     "calibration/data/robot_file.py": 30,
     "calibration/data/runs.py": 37,
     "calibration/data/sources/reading.py": 28,
-    # Being edited in another branch today: discrepancy and mechanism of the loop.
-    "calibration/discovery/discrepancy.py": 27,
-    "calibration/discovery/mechanism.py": 32,
     # Observers join a kind of data with its fidelity and its solver; calibration and sizing join all steps of a fit.
     "calibration/inference/calibration.py": 47,
     "calibration/inference/observers/settled.py": 49,
@@ -142,7 +139,7 @@ MORE_NAMES = {
     "mmrjax/undercarriage/half_robot.py": 44,
     # Commands read options and input, compute, write and report.
     "sweeps/commands/climb.py": 35,
-    "sweeps/commands/loop.py": 36,
+    "sweeps/commands/loop.py": 35,
     "sweeps/commands/loop_joints.py": 30,
     "sweeps/commands/missions.py": 33,
     "sweeps/commands/resonance.py": 36,
@@ -158,7 +155,7 @@ MORE_NAMES = {
     "sweeps/points/run.py": 36,
     "sweeps/points/tasks.py": 33,
     "sweeps/points/zarr_store.py": 29,
-    "sweeps/report/loop_report.py": 29,
+    "sweeps/report/loop_report.py": 28,
     "sweeps/report/mission_report.py": 28,
     "sweeps/report/runs_report.py": 29,
     "sweeps/report/sweep_report.py": 26,

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Names
+from calibration.discovery import smooth
 from calibration.discovery.active_set import ActiveSet, CandidateSpace, with_only
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
@@ -26,9 +27,7 @@ from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import diagnose_fit, family_columns
 from calibration.discovery.settings import Settings
-from calibration.discovery.smooth import SmoothCurve, fit_smooth_curve
 from calibration.inference import bases as bases_room
-from calibration.inference.bases import Bases
 from calibration.inference.blocks import fit_from_each_start
 from calibration.inference.linearization import Linearization
 from calibration.inference.priors import Coordinates
@@ -56,7 +55,7 @@ PARALLEL = 0.98
 # --- location -------------------------------------------------------------------------------------------
 
 
-def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLocation:
+def locate_discrepancy(left: Diagnosis, bases: bases_room.Bases, included: np.ndarray) -> DiscrepancyLocation:
     """Location of a discrepancy: its balance or channel, its variable, and the places that explain the data as well.
 
     The place is that of the most significant smooth curve. The variable is that of the curve with most evidence
@@ -83,7 +82,7 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
         smoothly = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
         # A voltage acts on torques and slip only through currents and speeds, so it may be listed but never leads.
         direct = [i for i in smoothly if place not in MECHANICAL or names[i][1] != "voltage"]
-        evidence = {i: fit_smooth_curve(left.linear, *names[i], included).evidence for i in direct or smoothly}
+        evidence = {i: smooth.fit_smooth_curve(left.linear, *names[i], included).evidence for i in direct or smoothly}
         j = max(evidence, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in same_kind)
     best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
@@ -159,7 +158,7 @@ def refine_window(
     return bases_room.Window(axis, float(x[inside].min()), float(x[inside].max())), float(gain[k])
 
 
-def location_columns(linear: Linearization, bases: Bases, where: DiscrepancyLocation) -> np.ndarray:
+def location_columns(linear: Linearization, bases: bases_room.Bases, where: DiscrepancyLocation) -> np.ndarray:
     """Sensitivity of the readings to a discrepancy in a location, shape (readings, terms).
 
     The terms are those of the location's family of curves. A temporary change is constant in its window, whose ends
@@ -235,7 +234,7 @@ class FittedCurve:
     converged: bool
 
 
-def fit_curve(space: CandidateSpace, base: Candidate, at_base: SmoothCurve) -> FittedCurve:
+def fit_curve(space: CandidateSpace, base: Candidate, at_base: smooth.SmoothCurve) -> FittedCurve:
     """Fits a smooth curve together with the base.
 
     Args:
@@ -291,7 +290,7 @@ class BaseCurve:
     space: CandidateSpace
     base: Candidate
     left: Diagnosis
-    bases: Bases
+    bases: bases_room.Bases
 
     @property
     def settings(self) -> Settings:
@@ -309,9 +308,9 @@ class BaseCurve:
         return PLACES[self.where.place][0]
 
     @functools.cached_property
-    def at_base(self) -> SmoothCurve:
+    def at_base(self) -> smooth.SmoothCurve:
         """The curve to first order at the base fit."""
-        return fit_smooth_curve(self.left.linear, self.where.place, self.where.variable, self.space.included)
+        return smooth.fit_smooth_curve(self.left.linear, self.where.place, self.where.variable, self.space.included)
 
     @functools.cached_property
     def proposal(self) -> Proposal:

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.data.runs import Runs
-from calibration.discovery import gains
+from calibration.discovery import gains, standing
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate, excess_misfit, share_of_excess
 from calibration.discovery.classes import ammeter_families, errors_of_ammeters
@@ -25,7 +25,6 @@ from calibration.discovery.prediction import Predicted, masks_of_blocks
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
-from calibration.discovery.standing import changed_run, evidence_over_curves, kept_readings, recurrence_of_families
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 
@@ -60,14 +59,17 @@ def find_mechanism(
     curved = [(located, False)] * (located in alike and space.bare.observe.reads)
     run, changed, root = None, "", 0.0
     if over_time:
-        run, changed, root = changed_run(space, linear, beside.bases, Projection.of(linear))
+        run, changed, root = standing.changed_run(space, linear, beside.bases, Projection.of(linear))
     blocks = masks_of_blocks(blocks_room.predictable_blocks(runs, space.bare))
     curves = functools.cache(functools.partial(_curves_without_blocks, beside, blocks))
     mechanisms: list[Mechanism] = []
     for leader, with_effects in (*by_name[:1], *curved, *by_name[1:]):
         effects: Names = ()
         families = (leader, *alike, *(() if with_effects else less))
-        if with_effects and evidence_over_curves(beside, best[leader], base, best[leader].effects, linear) < -BETTER:
+        if (
+            with_effects
+            and standing.evidence_over_curves(beside, best[leader], base, best[leader].effects, linear) < -BETTER
+        ):
             # A driver whose form a curve refutes is no better than those that curves cannot separate.
             families = (*families, *location_families)
         families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
@@ -75,7 +77,7 @@ def find_mechanism(
             effects, gain = gains.best_hold_out_gain(
                 space, runs, ladder, best[leader], base, pairs[leader], predicted
             )
-            again = recurrence_of_families(beside, best[leader], families, blocks)
+            again = standing.recurrence_of_families(beside, best[leader], families, blocks)
             if again < AGAIN:  # several effects together may be found again only by their sum
                 again = max(again, _curve_recurrence(*curves(), families, settings))
         else:
@@ -191,7 +193,7 @@ def _curves_without_blocks(beside: BaseCurve, blocks: Sequence[np.ndarray]) -> t
     columns, fit = [family_columns(linear, beside.bases, k) for k in smooth], Projection.of(linear)
     explained = []
     for out in (np.zeros(len(space.included), bool), *blocks):
-        kept_rows = kept_readings(space, out, linear.readings)
+        kept_rows = standing.kept_readings(space, out, linear.readings)
         without_block = fit.only(kept_rows)
         explained.append([without_block.explained(c[kept_rows]) for c in columns])
     return families, np.array(explained)
