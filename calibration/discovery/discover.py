@@ -1,4 +1,4 @@
-"""The closed loop: its stages in order, and its verdicts at other noise levels."""
+"""The closed loop: its stages in order, see `STAGES`, and its verdicts at other noise levels."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 from calibration.data import Priors
 from calibration.data.columns import ROWS
@@ -155,11 +156,27 @@ def _remarks_on_noise(
 # --- the stages -----------------------------------------------------------------------------------------
 
 
-def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.LoopStages:
-    """Runs the stages of the loop up to the verdict. Each stage is a function of earlier stages.
+class Stage(NamedTuple):
+    """One stage of the loop.
 
-    A log may get its verdict from its windows, its settled runs or its linear readings. Otherwise the base is tested,
-    effects are searched for, and the claim follows from them.
+    Attributes:
+        name: name of the stage, and of its file if it is stored.
+        inputs: results of earlier stages that it needs.
+        function: function of the `LoopInput` and of these results. It returns its results, or `LoopStages` if it
+            reaches the verdict.
+        results: names of its results.
+        stored: True if its results are stored. The search stores each of its rounds.
+    """
+
+    name: str
+    inputs: tuple[str, ...]
+    function: Callable[..., Any]
+    results: tuple[str, ...] = ()
+    stored: bool = False
+
+
+def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.LoopStages:
+    """Runs the stages of the loop, in the order of `STAGES`, until one reaches the verdict.
 
     With `ahead`, other cores compile the programs of later stages during the fit of the base.
 
@@ -168,18 +185,14 @@ def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.L
     """
     with contextlib.ExitStack() as others:
         given = dataclasses.replace(given, others=others if ahead else None, later=[], ranked=[])
-        if (traced := trace_known_readings(given)) is not None:
-            return traced
-        begin = trace_windows(given)
-        if isinstance(begin, verdict.LoopStages):
-            return begin
-        screened, sds = given.keep("base", lambda: stages.fit_base_and_noise(given, begin))
-        if (traced := trace_settled_runs(given, begin, screened)) is not None:
-            return traced
-        if (traced := trace_readings(given, begin, screened, sds)) is not None:
-            return traced
-        screened, left, searched = stages.search_until_clean(given, screened, sds)
-        return stages.reach_verdict(given, screened, left, sds, searched)
+        context: dict[str, Any] = {}
+        for stage in STAGES:
+            run = functools.partial(stage.function, given, *(context[name] for name in stage.inputs))
+            outcome = given.keep(stage.name, run) if stage.stored else run()
+            if isinstance(outcome, verdict.LoopStages):
+                return outcome
+            context |= zip(stage.results, outcome if len(stage.results) > 1 else (outcome,), strict=False)
+    raise AssertionError("the last stage reaches a verdict")
 
 
 def trace_known_readings(given: loop_input.LoopInput) -> verdict.LoopStages | None:
@@ -241,3 +254,15 @@ def trace_readings(
         return None
     readings = log_stages.readings_of_log(given, screened, sds, bool(given.ranked) or begin is not None)
     return log_stages.confirm_readings(given, readings, screened, sds, trace_verdict(readings))
+
+
+#: The loop. A log may get its verdict from its windows, its settled runs or its linear readings.
+STAGES = (
+    Stage("other noise", (), trace_known_readings),
+    Stage("windows", (), trace_windows, ("begin",)),
+    Stage("base", ("begin",), stages.fit_base_and_noise, ("screened", "sds"), stored=True),
+    Stage("settled", ("begin", "screened"), trace_settled_runs),
+    Stage("readings", ("begin", "screened", "sds"), trace_readings),
+    Stage("search", ("screened", "sds"), stages.search_until_clean, ("screened", "left", "searched")),
+    Stage("verdict", ("screened", "left", "sds", "searched"), stages.reach_verdict),
+)

@@ -1,4 +1,4 @@
-"""Stages of the loop: from the fit of the base to the verdict, see `discover.trace_verdict`."""
+"""Stages of the loop: from the fit of the base to the verdict, see `discover.STAGES`."""
 
 from __future__ import annotations
 

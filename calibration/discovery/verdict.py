@@ -56,7 +56,7 @@ PENDING: Any = None
 
 @dataclasses.dataclass(frozen=True)
 class LoopStages:
-    """Results of the stages of the loop, in the order of `discover.trace_verdict`.
+    """Results of the stages of the loop, in the order of `discover.STAGES`.
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
