@@ -12,14 +12,13 @@ from worlds import paper
 
 import mmrjax as mm
 from calibration.data import robot_file
-from calibration.data.input_errors import BadConfiguration
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import mission
 from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.signals import STATUSES
-from tests.commands import ends, read_json, read_rig, rows
+from tests.commands import ends, read_json, rows
 
 HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
 #: Room for the steps of a mission, as the command keeps; one program serves all with the same cut-off.
@@ -224,15 +223,6 @@ def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(tmp_path, m
     assert float(last["distance_m"]) == pytest.approx(-float(last["displacement_m"]), rel=1e-6)
 
 
-def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
-    with pytest.raises(BadConfiguration) as said:
-        read_rig(tmp_path, "[battery]\nvoltage_cutoff = 4.18\n", "low.toml")
-    assert str(said.value) == (
-        "low.toml, battery.voltage_cutoff: got 4.18 V; expected less than voltage_full, 4.17 V: a full cell would be "
-        "cut off"
-    )
-
-
 def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
     (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 2.9\n")
     assert robot_file.parse_robot_file(tmp_path / "low.toml").remarks == (
@@ -241,14 +231,6 @@ def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
     )
     (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 3.45\n")
     assert robot_file.parse_robot_file(tmp_path / "low.toml").remarks == ()
-
-
-def test_a_mission_that_begins_below_its_cut_off_is_refused(tmp_path, mmrjax):
-    code, out, err = mmrjax(*written(tmp_path, 3.5), "--discharge", "2000", "--out", "b")
-    assert (code, out) == (2, "") and not (tmp_path / "b").exists()
-    assert (
-        "--discharge: got 2000 mAh; a cell is then at 3.377 V, below its cut-off of 3.5 V, before the mission" in err
-    )
 
 
 def test_python_says_what_is_wrong_with_a_cut_off(robot):

@@ -8,10 +8,9 @@ import pandas as pd
 import pytest
 
 from calibration.data import robot_file
-from calibration.data.input_errors import BadConfiguration
 from sweeps.commands import rig_numbers
 from sweeps.commands.rig_new import write_new_rig
-from tests.commands import ends, read_json, refused
+from tests.commands import ends, read_json
 
 #: maxon RE30 310007, as printed.
 RE30 = {
@@ -100,33 +99,6 @@ def test_numbers_that_differ_widen_the_constant():
     found = rig_numbers.read_data_sheet(RE30 | {"stall-torque": "1090 mNm"})
     assert float(found["motor.torque_constant"].width.split()[0]) == pytest.approx(7.5, abs=0.3)
     assert rig_numbers.read_data_sheet(RE30)["motor.torque_constant"].width == "3 %"
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"resistance": "1.2 ohm"}, r"resistance is 1.2 ohm \(resistance\) and 0.611 ohm \(voltage / stall current\), 96 %"),
-        ({"stall-torque": "0.5 Nm"}, r"torque constant is 0.0259 N·m/A .* and 0.0128 N·m/A .*, 103 % apart; expected at most 10 %"),
-        ({"no-load-current": "40 A"}, r"--no-load-current: got 40 A, but the stall current is 39.3 A; expected less"),
-        ({"voltage": "24"}, r"--voltage: got 24; expected a positive number with a unit: V, mV"),
-        ({"no-load-speed": "-3 rpm"}, r"--no-load-speed: got -3 rpm; expected a positive number"),
-        ({"stall-current": "39,3 A"}, r"--stall-current: got 39,3 A; expected a positive number"),
-        ({"no-load-speed": None, "stall-torque": None}, r"--no-load-speed and --stall-torque: both missing"),
-        ({"no-load-current": None}, r"--no-load-current: missing; the motor friction"),
-        ({"voltage": None, "resistance": None, "stall-current": None}, r"missing --voltage, --stall-current, --resistance"),
-    ],
-)  # fmt: skip
-def test_sheets_that_contradict_themselves_or_lack_numbers_are_refused(change, message):
-    with refused(message, BadConfiguration):
-        rig_numbers.read_data_sheet({name: text for name, text in (RE30 | change).items() if text is not None})
-
-
-def test_sheet_without_numbers_leaves_no_file(mmrjax, tmp_path):
-    ends(
-        mmrjax("rig new r.toml --from-sheet"),
-        "--from-sheet: no motor data; expected --no-load-current and at least three of",
-    )
-    assert not list(tmp_path.iterdir())
 
 
 def test_rig_new_lists_what_robot_and_sheet_do_not_state(mmrjax, tmp_path):

@@ -111,19 +111,6 @@ def test_keys_of_a_file_are_read_and_options_win(tmp_path):
     assert config.resolve_configuration(config.Loop, file, {"rows": 1600}).rows == 1600
 
 
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("replicate = 300\n", r"c.toml, replicate: no such key; did you mean replicates"),
-        ("replicates = 3\n", r"c.toml, replicates: got 3; expected 250 to 100000"),
-        ("members = 'kept.npz'\n", r"c.toml, members: no such key; "),
-    ],
-)
-def test_keys_of_a_file_that_cannot_be_are_refused_in_a_sentence(text, message, tmp_path):
-    with refused(message, BadConfiguration):
-        config.resolve_configuration(config.Loop, _file(tmp_path, text), {})
-
-
 def test_configuration_of_one_command_names_what_another_lacks(tmp_path, monkeypatch, said):
     monkeypatch.chdir(tmp_path)
     _file(tmp_path, 'model = "drive"\nduration_s = 0.0\n')

@@ -12,7 +12,6 @@ from synthetic import SETTLED, STATED
 
 from calibration.data import inferred_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import findings, loop_input
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
@@ -192,13 +191,6 @@ def test_a_mass_that_no_robot_has_is_refused(robot):
     says = r"runs\.csv row 1, total_mass_kg: got 0\.003 with a payload of 0 kg; expected 0\.01 to 10000 kg without"
     with refused(says):
         inferred_facts.with_table_mass(robot, runs)
-
-
-def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
-    says = r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column or the prior"
-    with refused(says, BadConfiguration):
-        calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})
-    inferred_facts.check_priors(["4W2T.mass"], robot, unweighed(table()))
 
 
 # --- what calibration writes (what the loop writes: tests/test_prediction.py) ---------------------------

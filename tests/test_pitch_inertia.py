@@ -1,7 +1,5 @@
 """Moment of inertia in pitch: from the parts of Table 7 and the posture, against what the paper prints."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -119,24 +117,3 @@ def test_inertia_stated_as_a_whole_is_that_of_the_folded_robot_without_payload(r
     stretched = params.replace(robot, OUTSTRETCHED | {"running_gear.inertia_tracked": 0.2})
     lever = 4 * 0.495 * ((0.15 + 0.083) ** 2 - (0.15 - 0.083) ** 2)
     assert whole(stretched) == pytest.approx(0.2 + lever, rel=1e-9)
-
-
-def test_robot_lighter_than_its_parts_is_refused(robot):
-    light = params.replace(robot, {"6T2A.mass": 2.0})
-    with pytest.raises(
-        ValueError, match=r"6T2A\.mass: got 2 kg; expected more than 2\.8 kg, the mass of its pulleys"
-    ):
-        masses.check_parts(light)
-
-
-@pytest.mark.parametrize(
-    "name, least", [("inertia_tracked", r"0\.0343 kg.*of 6T2A"), ("inertia_wheeled", r"0\.0272 kg.*of 4W2T")]
-)
-def test_stated_inertia_below_that_of_the_parts_is_refused(robot, name, least):
-    small = params.replace(robot, {f"running_gear.{name}": 0.01})
-    with pytest.raises(
-        ValueError, match=rf"running_gear\.{name}: got 0\.01 kg·m\^2; expected 0, or more than {least}"
-    ):
-        masses.check_parts(small)
-    masses.check_parts(params.replace(robot, {f"running_gear.{name}": 0.1}))
-    masses.check_parts(dataclasses.replace(robot, sides=jnp.asarray(1.0)))

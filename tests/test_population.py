@@ -247,21 +247,6 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch, 
         calibrate(runs, robot, model="drive", free=(name,), population=4, generations=1)
 
 
-@pytest.mark.quick(1)
-@pytest.mark.parametrize(
-    "options, says",
-    [
-        (dict(generations=3), "--generations: has an effect only with --population"),
-        (dict(population=50), "a population search needs settled rows and --model drive or track"),
-        (dict(population=2, model="drive"), "at least 4 members"),
-        (dict(generations=3, population=0, model="track"), "--generations: has an effect only with --population"),
-    ],
-)
-def test_options_of_a_population_that_cannot_be_are_refused(options, says, robot):
-    with refused(says, BadConfiguration):
-        calibrate(records.read_runs("measured"), robot, **options)
-
-
 @pytest.mark.nightly
 def test_running_gear_is_found_through_the_track_model():
     """Readings of a shaking gear. The population comes near its slip, which the flush gear does not."""

@@ -5,7 +5,6 @@ import pytest
 
 from calibration.data import contradictions
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import params
 from sweeps.inputs import one_run
 from sweeps.report import turn_words
@@ -39,28 +38,6 @@ def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
     assert conditions.levers_rear_deg is None and conditions.states_levers
     tops = turn_words.posture_of_runs(raised, one_run(raised, {"levers_front_deg": 20.0}), conditions).table
     assert tops["tip_rear_mm"][0] == pytest.approx(262, abs=1)
-
-
-@pytest.mark.parametrize(
-    "cells, words",
-    [
-        (
-            {"configuration": "4W2T", "levers_rear_deg": 10.0},
-            "--levers-rear: 4W2T has no levers; configurations with levers: 6T2A",
-        ),
-        ({"levers_front_deg": 200.0}, "levers_front_deg: got 200; expected -180 to 180"),
-    ],
-)
-def test_levers_that_cannot_be_are_refused(robot, cells, words):
-    with refused(words, BadConfiguration):
-        one_run(robot, cells)
-
-
-def test_angle_beyond_the_range_of_a_robots_levers_is_refused(robot):
-    narrow = params.replace(robot, {"running_gear.levers.angle_least": np.radians(-45.0)})
-    words = r"--levers-rear: got -60; expected -45 to 180, the range of the robot's levers"
-    with refused(words, BadConfiguration):
-        one_run(narrow, {"levers_rear_deg": -60.0})
 
 
 def test_a_table_states_levers_by_row(robot, tmp_path):

@@ -230,43 +230,6 @@ def test_ros_2_effort_is_what_the_preset_assumes(tmp_path, topic, preset, column
     assert any(f"read as {column}, is assumed to be" in note for note in table.notes)
 
 
-WRONG = {
-    "another name": ("vesk", r"got vesk; no such file and no packaged preset; did you mean vesc\?"),
-    "a number that is none": ("vesc,pole_pairs=x", "got pole_pairs=x; expected a name and a number"),
-    "no poles": ("vesc,pole_pairs=0", "pole_pairs: got 0; expected a number that is not 0"),
-    "another number": ("moteus,pole_pairs=7", "got pole_pairs; it defines no numbers under"),
-}
-FILES = {
-    "another column": ('[columns]\nmotor_sped_rpm = "n"', "columns.motor_sped_rpm: no such column of a table"),
-    "another key": ('[colums]\ntime_s = "t"', r"got the key colums; did you mean columns\?"),
-    "a list of numbers": ("[columns]\ntime_s = [1]", 'expected time_s = "LOGGER COLUMN"'),
-    "a factor of nothing": ('[columns]\ntime_s = {column = "t", factor = 0}', "factor: got 0; expected a number"),
-    "a number without a name": (
-        '[columns]\ntime_s = {column = "t", per = "n"}',
-        r"got n; expected one of the numbers defined under \[ask\]",
-    ),
-    "a part of a bit": (
-        '[columns]\ntime_s = {column = "t", sign_bit = 1.5}',
-        "sign_bit: got 1.5; expected a whole number",
-    ),
-    "nothing": ("", "expected a table of columns"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG | FILES)
-def test_a_preset_that_cannot_be_is_refused(tmp_path, case):
-    stated, says = (WRONG | FILES)[case]
-    with refused(says, BadConfiguration):
-        presets_file.find_preset(stated if case in WRONG else text_file(tmp_path / "mine.toml", stated))
-
-
-def test_a_file_of_another_logger_is_refused_with_its_columns(tmp_path):
-    with refused(r"has none of the columns of vesc \(ms_today, .*\), but a, b"):
-        records.read_runs(
-            {"a": [1.0, 2.0], "b": [1.0, 2.0]}, robot(tmp_path, "motor_speed"), columns="vesc,pole_pairs=7"
-        )
-
-
 @pytest.mark.parametrize("imposed", ["voltage", "motor_speed"])
 def test_a_supply_without_its_duty_does_not_drive_the_motor(tmp_path, imposed):
     text = "input_voltage,erpm,current_motor\n40,7000,3\n41,8000,4\n"

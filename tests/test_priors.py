@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from calibration.inference.fit_notes import Remark
 from calibration.inference.preparation import inherited_friction_remarks
 from mmrjax.effects import ALL
 from mmrjax.model import paper_robots, params
-from tests.commands import read_rig, refused
+from tests.commands import read_rig
 
 EVERY = [
     p.name
@@ -107,26 +106,6 @@ def test_choose_takes_default_groups_and_fixes(robot):
     )
 
 
-@pytest.mark.parametrize(
-    "free, fix, says",
-    [
-        (["6T2A.mu"], [], r"--free 6T2A.mu: no such parameter; .*allowed: 6T2A\."),
-        (
-            ["rolling_resistance"],
-            [],
-            r"allowed: 6T2A.ground.rolling_resistance, 4W2T.ground.rolling_resistance",
-        ),
-        (["engine.*"], [], r"--free engine.\*: no parameters below it; .*motor.\*"),
-        ([], ["gearbox.raito"], r"--fix gearbox.raito: .*did you mean gearbox.ratio\?"),
-        (["motor.resistance"], ["motor.resistance"], "--free and --fix both name motor.resistance"),
-        ([], ["6T2A.*", "4W2T.*"], "--fix leaves no parameter to fit"),
-    ],
-)
-def test_choose_refuses_with_the_choices(robot, free, fix, says):
-    with refused(says, BadConfiguration):
-        priors.choose_free_names(robot, priors.default_names(("6T2A", "4W2T"), robot), free, fix)
-
-
 def test_default_set_is_friction_of_what_has_rows_with_the_guides_share_on_tracks(robot):
     names = priors.default_names(["4W2T"], robot)
     assert names == tuple(f"4W2T.{n}" for n in priors.FRICTION)
@@ -139,31 +118,6 @@ def test_parse_prior_reads_all_forms():
     assert priors.parse_prior(f"{name}=4.5e-1+-0.05") == (name, 0.45, 0.05)
     assert priors.parse_prior("crawler-2.mass=4±0.1") == ("crawler-2.mass", 4.0, 0.1)
     assert priors.parse_prior(f"{name} =0.45 ± 10%".replace(" =", "="))[2] == pytest.approx(0.045)
-
-
-@pytest.mark.parametrize("text", ["a", "a=1", "a=x±1", "a=1±x", "a=1±0", "a=1±-1", "a=1±nan"])
-def test_parse_prior_refuses(text):
-    with refused(r"--prior .*name=value±sd", BadConfiguration):
-        priors.parse_prior(text)
-
-
-@pytest.mark.parametrize(
-    "names, stated, says",
-    [
-        (["motor.resistance"], {"motor.resistanse": (1, 1)}, "no such parameter; did you mean motor.resistance"),
-        (["motor.resistance"], {"motor.inertia": (1, 1)}, "is not free; add --free motor.inertia"),
-        (["motor.resistance"], {"motor.resistance": (5000.0, 1)}, "got 5000; expected 0.001 to 1000 ohm"),
-    ],
-)
-def test_coordinates_refuse_stated_priors(robot, names, stated, says):
-    with refused(says, BadConfiguration):
-        priors.parameter_coordinates(robot, names, stated)
-
-
-def test_coordinates_refuse_a_prior_without_width():
-
-    with refused(r"motor.friction_viscous: its prior has no width", BadConfiguration):
-        priors.parameter_coordinates(paper_robots.sm1(), ["motor.friction_viscous"])
 
 
 def test_stated_prior_moves_the_centre(robot):

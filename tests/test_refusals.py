@@ -15,6 +15,17 @@ KINDS = "bench", "linear", "pendulum", "wheeled"
 RIGS = {f"{kind}{end}.toml" for kind in KINDS for end in ("", "_speed")}
 
 
+def content(source):
+    """The text of a file: as stated, or that of another file with some of its texts replaced."""
+    if isinstance(source, str):
+        return source
+    name, *changes = source
+    text = FILES[name] if name in FILES else (ROOT / "tests/data" / name).read_text(encoding="utf-8")
+    for old, new in zip(changes[::2], changes[1::2], strict=True):
+        text = text.replace(old, new) if old else text + new
+    return text
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """The files of `refusals.toml`, and a rig of each kind."""
@@ -34,7 +45,7 @@ def test_command_is_refused_in_one_line_and_leaves_nothing(mmrjax, folder, monke
     case = CASES[name]
     monkeypatch.chdir(folder)
     for file, text in {**FILES, **case.get("files", {})}.items():
-        text_file(folder / file, text)
+        text_file(folder / file, content(text))
     before = {*folder.iterdir()}
     words = shlex.split(case["words"])
     code, out, err = mmrjax(words[0], *words[1:])

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration
 from calibration.inference import bases, observers
 from sweeps.commands import rig_check
-from tests.commands import read_rig, refused, text_file
+from tests.commands import read_rig, text_file
 
 BRAKE = """
 base = "none"
@@ -35,54 +34,6 @@ def table(tmp_path, *rows, header="motor_speed_rpm,total_current_A"):
     path = tmp_path / "t.csv"
     path.write_text("\n".join((header, *rows)) + "\n", encoding="utf-8")
     return path
-
-
-FILES = {
-    "a key misspelt": (
-        BRAKE.replace("inertia = ", "inertai = "),
-        r"rig\.toml: brake\.inertia \[kg·m\^2\] is missing; .*; is brake\.inertai meant to be brake\.inertia\?$",
-    ),
-    "no base": (
-        BRAKE.replace('base = "none"', ""),
-        r'brake: not one of the configurations .*, or set base = "none" for a rig that is described completely in this file$',
-    ),
-    "a plus for a ±": (
-        BRAKE.replace("0.041 ± 3 %", "0.041 + 3 %"),
-        r"motor\.torque_constant: got '0\.041 \+ 3 %'; expected a number, .* as \"0\.61 ± 0\.03\"$",
-    ),
-    "no number before the ±": (
-        BRAKE.replace("0.041 ± 3 %", "nan ± 1"),
-        r"motor\.torque_constant: got 'nan ± 1'; expected a number, or one with",
-    ),
-    "another key": (
-        'colour = "red"\n' + BRAKE,
-        r"colour: no such parameter; .*allowed: .*base, ",
-    ),
-    "a key of the rig misspelt": (
-        BRAKE.replace("imposed", "impose"),
-        r"impose: no such parameter; did you mean imposed\? allowed: ",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", FILES)
-def test_a_mistake_in_a_rigs_file_is_one_sentence(tmp_path, case):
-    text, message = FILES[case]
-    with refused(message, BadConfiguration):
-        rig_of(tmp_path, text)
-
-
-def test_a_folder_is_no_rigs_file(tmp_path):
-    with refused(r"is a folder; expected a rig's TOML file$", BadConfiguration):
-        rig_check.check_rig_file(tmp_path, None, (), False)
-
-
-@pytest.mark.parametrize("rows", [("900,-0.6", "1800,-0.7"), ("900,-0.6", "1800,0.7", "-900,-0.6")])
-def test_a_current_against_the_imposed_speed_is_refused_forward_too(tmp_path, rows):
-    robot = rig_of(tmp_path, BRAKE)
-    message = r"t\.csv row 1, total_current_A: got -0\.6 at 900 rpm; nothing else drives the motors, so the reading should have its sign"
-    with refused(message):
-        records.read_runs(table(tmp_path, *rows), robot=robot)
 
 
 def test_noise_about_zero_and_a_weight_are_no_wrong_signs(tmp_path):

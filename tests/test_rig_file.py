@@ -334,93 +334,6 @@ def without(text, *keys):
     return "\n".join(line for line in text.splitlines() if line.partition(" =")[0] not in keys)
 
 
-REFUSED = {
-    "no load": ('base = "none"\n[motor]\nresistance = 1.0\n', r"no load is defined; add a table such as \[bench\] with load"),
-    "unknown base": ('base = "nothing"', r"base: got nothing; .*none"),
-    "vehicle without mass": (without(ROVER, "mass"), r'rig\.toml: rover\.mass \[kg\] is missing; a robot with base'),
-    "all that is missing": (
-        'base = "none"\n[bench]\nload = "shaft"\n',
-        r"gearbox\.ratio \[-\], gearbox\.efficiency_load \[-\], motor\.torque_constant \[N·m/A\], motor\.resistance "
-        r"\[ohm\], bench\.inertia \[kg·m\^2\], bench\.loss_coulomb \[N·m\] are missing",
-    ),
-    "no voltage known": (
-        BENCH.replace('["total_current"]', '["total_current", "motor_voltage"]'),
-        r"motor\.resistance \[ohm\] is missing",
-    ),
-    "speed of a shaft": (
-        BENCH.replace('["total_current"]', '["total_current", "speed"]'),
-        r"bench\.radius \[m\] is missing",
-    ),
-    "ratio upside down": (
-        BENCH.replace("ratio = 16", "ratio = 0.0625"),
-        r"gearbox\.ratio: got 0\.0625; expected motor turns per output turn, at least 1; is 16 meant\?",
-    ),
-    "vehicle and shaft": (
-        BENCH + ROVER[ROVER.index("[rover]") :],
-        r"bench is a shaft and rover a vehicle; a file can describe only one kind",
-    ),
-    "unknown load": (BENCH.replace('"shaft"', '"shafts"'), r"bench\.load: got shafts; did you mean shaft\?"),
-    "shaft on wheels": (BENCH + 'movers = "wheels"', r"bench: load = 'shaft' and movers contradict"),
-    "not said what": (
-        BENCH + "[other]\ninertia = 1.0\n",
-        r"other: the kind of load is missing; set load = one of shaft, linear, vehicle",
-    ),
-    "not among": ('configurations = ["bench"]' + BENCH + '[slow]\nload = "shaft"', r"slow: not one of the configurations"),
-    "vehicle with a parameter of a shaft": (
-        ROVER.replace("mass = 4.0", "mass = 4.0\ntorque_gravity = 1.0"),
-        r"rover\.torque_gravity: no such parameter",
-    ),
-    "unknown imposed": (BENCH.replace('"motor_speed"', '"torque"'), r"imposed: got torque; allowed: voltage, motor_speed"),
-    "imposed and read": (
-        BENCH.replace('["total_current"]', '["motor_speed"]'),
-        r'channels: motor_speed is imposed, so it cannot be a reading; remove it, or set imposed = "voltage"',
-    ),
-    "unknown channel": (
-        BENCH.replace('["total_current"]', '["totalcurrent"]'),
-        r"channels: got totalcurrent; did you mean total_current\?",
-    ),
-    "no channels": (BENCH.replace('["total_current"]', "[]"), r"channels: got \[\]; expected a list of channels"),
-    "unknown start": ('start = "still"' + BENCH, r"start: got still; allowed: rest, measured, free"),
-    "unknown column": (BENCH + '[columns]\ntotal_curent_A = "I"', r"columns\.total_curent_A: no such column .*total_current_A"),
-    "odd column": (BENCH + "[columns]\ntotal_current_A = 3", r"columns\.total_current_A\.column: got 3; expected total_current_A = \"LOGGER COLUMN\""),
-    "factor 0": (
-        BENCH + '[columns]\ntotal_current_A = {column = "I", factor = 0}',
-        r"total_current_A\.factor: got 0; expected a number that is not 0",
-    ),
-    "instrument of no channel": (
-        BENCH + "[instruments.speed]\nsigned = false",
-        r"instruments\.speed: the rig has no such channel; allowed: total_current",
-    ),
-    "odd instrument": (BENCH + "[instruments.total_current]\nstep = 1", r"total_current\.step: no such key; allowed: signed, quantum"),
-    "negative step": (
-        BENCH + "[instruments.total_current]\nquantum = -1",
-        r"quantum: got -1; expected the resolution of its readings, 0 or more A",
-    ),
-    "signed in words": (BENCH + '[instruments.total_current]\nsigned = "no"', r"signed: got 'no'; expected true, false \(shows only the magnitude\)"),
-    "± nothing": (BENCH.replace("0.1 ± 0.05", "0.1 ± "), r"bench\.loss_coulomb: got '0\.1 ± '; expected a number, or one with"),
-    "± less than zero": (BENCH.replace("0.1 ± 0.05", "0.1 ± -1"), r"the standard deviation must be 0 \(exact\) or more"),
-    "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"a percentage of 0 is 0, so give the standard deviation itself"),
-    "± out of bounds": (BENCH.replace("0.8 +- 0.03", "1.8 ± 0.1"), r"efficiency_load: got 1\.8; expected 0\.05 to 1"),
-    "± of a rating": (BENCH + '[motor.x]\ny = 1\n', r"motor\.x\.y: no such parameter"),
-    "two travels": (
-        CARRIAGE.format(sides=1) + "mass_kg = 1.0\nlead_mm = 5.0\ndrum_radius_mm = 3.0\n",
-        r"carriage: got lead_mm and drum_radius_mm; expected one of the two",
-    ),
-    "no travel": (CARRIAGE.format(sides=1) + "mass_kg = 1.0\n", r"carriage: got neither lead_mm nor drum_radius_mm"),
-    "no mass": (CARRIAGE.format(sides=1) + "lead_mm = 1.0\n", r"carriage\.mass_kg: missing"),
-    "negative lead": (CARRIAGE.format(sides=1) + "mass_kg = 1.0\nlead_mm = -5.0\n", r"lead_mm: got -5\.0; expected a number above 0"),
-    "SI in a linear unit": (CARRIAGE.format(sides=1) + "mass = 1.0\nlead_mm = 5.0\n", r"carriage\.mass: no such key of a linear unit"),
-    "like nobody": (BENCH + '[b]\nlike = "bensh"', r"b\.like: got bensh; did you mean bench\?"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_bad_rigs_are_refused_in_one_sentence(tmp_path, case):
-    text, sentence = REFUSED[case]
-    with refused(rf"^(?=rig\.toml).*(?:{sentence})", BadConfiguration):
-        read_rig(tmp_path, text)
-
-
 def test_packaged_robot_is_as_it_was(tmp_path, robot):
     robot = robot_file.add_effects(robot, tuple(effects.BY_NAME))
     assert survives(tmp_path, robot) and "[rig]" not in (tmp_path / "again.toml").read_text()
@@ -506,15 +419,6 @@ def test_a_rig_check_reads_as_recorded(tmp_path, bench, capsys):
         text += f"{as_text(document)}# TERMINAL\n{capsys.readouterr().out}"
     (words_now, numbers_now), (words_then, numbers_then) = tokens(text), tokens(recorded("rig_check", text))
     assert words_now == words_then and numbers_now == pytest.approx(numbers_then, rel=1e-2, abs=1e-2)
-
-
-def test_rig_check_ends_with_2_for_the_file_and_4_for_the_data(mmrjax, bench, tmp_path):
-    ends(mmrjax("rig check mine.toml"), "mine.toml: no such file; mmrjax rig new mine.toml writes one to fill in")
-    text = (tmp_path / "my-rig.toml").read_text().replace("\nratio = 20.0", "")
-    (tmp_path / "lacking.toml").write_text(text)
-    ends(mmrjax("rig check lacking.toml"), "gearbox.ratio [-] is missing")
-    (tmp_path / "odd.csv").write_text("supply_voltage_V,total_current_A,motor_speed_rpm\n12,x,3000\n")
-    ends(mmrjax("rig check my-rig.toml odd.csv"), "odd.csv row 1, total_current_A: got x", code=4)
 
 
 ODD = {

@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.data.input_errors import BadConfiguration
 from calibration.data.stated import example_numbers, is_example
 from mmrjax.model import params
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import rig_from_mujoco, rig_new
 from sweeps.commands.rig_numbers import rig_template
-from tests.commands import ends, read_rig, refused, text_file
+from tests.commands import read_rig, text_file
 
 DIFFBOT = Path(__file__).parent / "data/diffbot.urdf"
 FREE = """<mujoco>
@@ -144,48 +143,6 @@ def test_losses_of_a_model_without_motor_constants_keep_the_lines_of_the_templat
 
 
 # --- bad robots -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "old, new, joint, message",
-    [
-        ("", "", "left_whel_joint", r"no such joint; did you mean left_wheel_joint\?"),
-        ("", "", "caster_joint", r"--joint: got caster_joint, which is fixed; expected one that turns: left_wheel_joint"),
-        ("", "", None, r"--joint: missing, and r.urdf has left_wheel_joint, right_wheel_joint;"),
-        ('type="continuous"', 'type="prismatic"', "left_wheel_joint", r"which is prismatic; .*rig new --kind linear"),
-        ('<mass value="0.32"/>', '<mass value="-1"/>', "left_wheel_joint", r"link left_wheel, <mass>: got value -1; expected 0 kg"),
-        ('<mass value="0.32"/>', '<mass value="${m}"/>', "left_wheel_joint", r"got '\$\{m\}'; expected a number \[kg\]; run xacro"),
-        ('izz="6.8e-4"', 'izz="0"', "left_wheel_joint", r"<inertia>: got 0 kg·m² about the axis of left_wheel_joint"),
-        ('<link name="tool">', '<a:arg xmlns:a="http://www.ros.org/wiki/xacro"/><link name="tool">', "arm_joint", r"r.urdf: contains xacro elements; run"),
-        ("inertial>", "inert>", "left_wheel_joint", r"link left_wheel: no <inertial>"),
-        ("<robot", "<robot><joint", "arm_joint", r"r.urdf: not a readable XML file \(mismatched tag"),
-        ("mechanicalReduction>34", "mechanicalReduction>0.1", "left_wheel_joint", r"left_drive, <mechanicalReduction>: got 0.1;"),
-        ('<child link="arm"/>', '<child link="am"/>', "arm_joint", r"joint arm_joint, <child>: got am; did you mean arm\?"),
-        ('<child link="tool"/>', '<child link="base_link"/>', "arm_joint", r"link \w+ is part of a loop; expected a tree"),
-        ('<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>', "arm_joint", r"<axis> xyz: got '0 1'; expected 3 numbers"),
-        ('<link name="tool">', '<link name="arm">', "arm_joint", r"<link>: two are called arm"),
-    ],
-)  # fmt: skip
-def test_robots_with_a_mistake_are_refused_in_a_sentence(old, new, joint, message, tmp_path):
-    text = DIFFBOT.read_text()
-    assert old in text
-    (tmp_path / "r.urdf").write_text(text.replace(old, new))
-    with refused(message, BadConfiguration):
-        rig_new.new_rig_text(None, tmp_path / "r.urdf", joint, None)
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        (("--from", "none.urdf"), "none.urdf: cannot be read"),
-        (("--from", str(DIFFBOT)), "--joint: missing"),
-        (("--from", str(DIFFBOT), "--joint", "arm_joint", "--kind", "linear"), "--kind: got linear with --from"),
-        (("--joint", "arm_joint"), "--joint: got arm_joint without --from"),
-    ],
-)
-def test_rig_new_that_is_refused_leaves_nothing_behind(mmrjax, tmp_path, options, message):
-    ends(mmrjax("rig new r.toml", *options), message)
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_replaced_number_is_no_example_even_with_its_comment():

@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose
 
 from calibration.data import configuration_tables, inferred_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration
 from calibration.inference import bases, blocks, checks, noise, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
@@ -126,122 +125,6 @@ def test_columns_of_other_names_are_those_that_the_robots_file_says(tmp_path):
 
 
 BENCH = "motor_speed_rpm,total_current_A\n"
-REFUSED = {
-    "a slope on a bench": (
-        bench,
-        "motor_speed_rpm,slope_deg,total_current_A\n1000,5,0.4\n",
-        r"slope_deg: got 5; the r",
-    ),
-    "a mass on a bench": (
-        bench,
-        "motor_speed_rpm,total_mass_kg,total_current_A\n9,5,0.4\n",
-        r"total_mass_kg: got 5; t",
-    ),
-    "one unit twice": (
-        bench,
-        "motor_speed_rpm,motor_speed_rad_s,total_current_A\n9,1,0.4\n",
-        r"motor_speed_rpm and mot",
-    ),
-    "nothing imposed": (
-        bench,
-        "total_current_A\n0.4\n",
-        r"column motor_speed_rpm is missing \(required: motor_speed_r",
-    ),
-    "no channel": (
-        bench,
-        "motor_speed_rpm,speed_mm_s\n9,0.4\n",
-        r"no column with readings; expected at least one of to",
-    ),
-    "an empty file": (bench, "", r"the file is empty; expected a header with motor_speed_rpm, total_current_A"),
-    "not a number": (
-        bench,
-        f"{BENCH}1000,?\n",
-        r"row 1, total_current_A: got \?; leave the cell empty if there is no reading; expected a number, -2000 to",
-    ),
-    "in its own unit": (
-        bench,
-        "motor_speed_rpm,total_current_mA\n9,3e6\n",
-        r"total_current_mA: got 3e6; expected -2e\+06 to 2e\+06",
-    ),
-    "an empty speed": (bench, f"{BENCH},0.4\n", r"row 1, motor_speed_rpm: got an empty cell; expected a number"),
-    "no speed": (bench, f"{BENCH}0,0.4\n", r"motor_speed_rpm is 0 in every row, so nothing drives the motors"),
-    "no sign": (
-        bench,
-        f"{BENCH}900,0.4\n-900,0.4\n",
-        r"row 2, .*: got 0.4 at -900 rpm; .*or signed = false for total_c",
-    ),
-    "no mass": (
-        lambda: vehicle(0.0),
-        "motor_speed_rpm,speed_mm_s\n900,5\n",
-        r"no column total_mass_kg, and the robot's",
-    ),
-    "too little voltage": (
-        bench,
-        "motor_speed_rpm,supply_voltage_V,total_current_A\n3000,5,0.4\n",
-        r"supply_voltage_V: got 5 at an imposed motor_speed_rpm of 3000, too small for the motors' back-EMF of 15.7 V",
-    ),
-    "voltage against speed": (
-        lambda: bench(shown=("total_current", "motor_voltage")),
-        "motor_speed_rpm,motor_voltage_V,total_current_A\n3000,-17,0.4\n",
-        r"motor_voltage_V: got -17 at an imposed motor_speed_rpm of 3000, with the wrong sign",
-    ),
-    "an angle that wraps at no turn": (
-        lambda: bench("voltage", ("output_angle",)),
-        "time_s,supply_voltage_V,output_angle_deg\n0,9,240\n1,9,250\n2,9,1\n3,9,11\n",
-        r"row 3, output_angle_deg: jumps by -249 deg from the sample before, like an angle that wraps",
-    ),
-    "a recording after another": (
-        lambda: bench("voltage", ("output_angle",)),
-        "time_s,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n2,9,360\n60,9,1\n61,9,11\n",
-        r"row 4, output_angle_deg: jumps by -359 deg from the sample before, 58 s earlier; give each recording its own run",
-    ),
-    "an unknown mapped column": (
-        lambda: bench(columns=(("currrent", "I", 1.0),)),
-        "motor_speed_rpm,I\n9,1\n",
-        r"reads currrent from column I; mmrjax has no column currrent",
-    ),
-    "a mapped column that is missing": (
-        lambda: bench(columns=(("motor_speed_rpm", "ticks_s", 1.0),)),
-        "total_current_A\n0.4\n",
-        r"column motor_speed_rpm \(in the robot's file: ticks_s\) is missing",
-    ),
-    "columns that may be it, the likeliest by its unit": (
-        bench,
-        "t,n [rpm],total_current_A\n1,900,0.4\n",
-        r"other columns: t, n \[rpm\]; .* motor_speed_rpm = {column = \"n \[rpm\]\"",
-    ),
-    "a torque in another unit": (
-        lambda: of_torque(),
-        "motor_speed_rpm,M\nrpm,kN·m\n900,4\n",
-        r"column M states kNm in the row of units below the header, .* output_torque_kNm = \"M\"",
-    ),
-    "a speed in another unit": (
-        lambda: of_torque(),
-        "motor_speed_rpm,M\nrad/s,Nm\n900,4\n",
-        r"motor_speed_rpm states rad_s in the row .*; name it motor_speed_rad_s, or",
-    ),
-    "an unknown unit": (
-        lambda: of_torque(),
-        "motor_speed_rpm,M\nrpm,lbf\n900,4\n",
-        r"M: got lbf in the row of units .*; expected one of Nm, mNm, kNm; correct or",
-    ),
-    "a negative magnitude": (
-        lambda: bench(instruments=(Instrument("total_current", signed=False),)),
-        f"{BENCH}900,0.4\n-900,-0.4\n",
-        r"row 2, total_current_A: got -0.4; expected no negative reading",
-    ),
-    "two runs as one": (
-        lambda: bench("voltage"),
-        "time_s,supply_voltage_V,total_current_A\n" + "".join(f"{k % 15 / 10},9,{k}\n" for k in range(30)),
-        r"row 16, time_s: goes back from 1\.4 to 0 s; give each recording its own run_id, or sort the rows",
-    ),
-    "a log without its time": (
-        lambda: bench("voltage", ("output_speed", "output_angle")),
-        "t,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n",
-        r"column time_s is missing, and output_angle_deg can be used only in a time history; if these are settled runs, remove .*; other "
-        r"columns: t; .*\[columns\] time_s = {column",
-    ),
-}
 
 
 @pytest.mark.parametrize(
@@ -331,13 +214,6 @@ def test_a_row_of_units_below_the_header_is_read(tmp_path):
 def test_comment_lines_above_the_header_are_passed_over(tmp_path, above):
     for text in ("motor_speed_rpm,total_current_A\n900,0.4\n", "motor_speed_rpm;total_current_A\n900;0,4\n"):
         assert read(tmp_path, above + text, bench())["total_current_A"].tolist() == [0.4]
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_bad_tables_of_rigs_are_refused_in_one_sentence(tmp_path, case):
-    make, text, sentence = REFUSED[case]
-    with refused(sentence):
-        read(tmp_path, text, make())
 
 
 def test_a_slope_of_nothing_on_a_bench_is_let_pass(tmp_path):
@@ -506,15 +382,6 @@ def test_a_slow_speed_where_the_stated_friction_holds_the_robot_is_no_matter_of_
     runs = with_columns(runs, motor_speed_rpm=runs["motor_speed_rpm"] / 60)
     assert np.all(steady_batch(robot, conditions).status == STALLED)
     assert check_ranges(runs, robot) == []
-
-
-def test_an_arm_has_no_steady_state(tmp_path):
-    robot = bench("voltage", ("motor_speed",), load={"torque_gravity": 0.2})
-    runs = read(
-        tmp_path, "supply_voltage_V,motor_speed_rpm\n" + "".join(f"{v},{v * 100}\n" for v in range(4, 14)), robot
-    )
-    with refused(r"rig has a gravity torque that depends on its angle, .*; use --model drive", BadConfiguration):
-        calibrate(runs, robot, noise="motor_speed=1%")
 
 
 def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):

@@ -7,7 +7,7 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
-from tests.commands import read_rig, refused, text_file
+from tests.commands import read_rig, text_file
 
 
 def values(robot):
@@ -87,127 +87,6 @@ def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
     crawler = read_rig(tmp_path, CRAWLER).configurations["crawler-2"]
     assert crawler.on_tracks == 1.0
     assert crawler.track.guide_friction == 0.20 and crawler.ground.friction.speed_static == 0.02
-
-
-REFUSED = {
-    "misspelt table": (
-        "[motr]\nresistance = 1",
-        r"rig\.toml, motr\.resistance: no such parameter; did you mean motor\.resistance",
-    ),
-    "misspelt key": (
-        "[motor]\nresistanc = 1",
-        r"motor\.resistanc: no such parameter; did you mean motor\.resistance",
-    ),
-    "negative mass": ("[6T2A]\nmass = -3", r"6T2A\.mass: got -3; expected 0\.01 to 10000 kg"),
-    "NaN": ("[motor]\nresistance = nan", r"motor\.resistance: got nan"),
-    "word": ("[motor]\nresistance = 'low'", r"motor\.resistance: got 'low'; expected a number"),
-    "boolean": ("[motor]\nresistance = true", r"got True; expected a number"),
-    "unknown effect": ("[effects.churn]\namplitude = 1", r"effects\.churn: no such effect; did you mean churning"),
-    "effect is no table": ("effects = 3", r"effects: got 3; expected tables"),
-    "effect stands as a number": ("[effects]\nchurning = 3", r"effects\.churning: no such parameter"),
-    "unknown base": ("base = 'best'", r"base: got best; allowed: nominal, sm1, sm2"),
-    "other schema": ("schema = 'x/9'", r"schema: got x/9; expected mmrjax\.robot/2"),
-    "unknown configuration": (
-        "[8T]\nmass = 2",
-        r"8T\.mass: no such parameter; did you mean 6T2A\.mass\? allowed: .*gearbox, 6T2A, 4W2T",
-    ),
-    "no configurations": ("configurations = []", r"configurations: got \[\]; expected a list of at least one name"),
-    "configurations as a word": (
-        "configurations = 'rover'",
-        r"configurations: got 'rover'; expected a list of at least one name",
-    ),
-    "a configuration twice": (
-        "configurations = ['6T2A', '6T2A']",
-        r"configurations: 6T2A is listed 2 times; name each once",
-    ),
-    "a configuration with a dot": (
-        "configurations = ['a.b']",
-        r"configurations: got 'a\.b'; expected letters, digits",
-    ),
-    "a configuration named as a part": (
-        "configurations = ['motor']",
-        r"motor has another meaning in robot",
-    ),
-    "a configuration from nowhere": (
-        "configurations = ['rover']",
-        r'rover: the base has no such configuration; set like = "6T2A" \(one of 6T2A, 4W2T\), or movers',
-    ),
-    "a configuration that is not listed": (
-        "[rover]\nlike = '4W2T'",
-        r"rover: not one of the configurations 6T2A, 4W2T; add it to configurations",
-    ),
-    "a configuration as a number": (
-        "configurations = ['rover']\nrover = 3",
-        r"rover: got 3; expected a table \[rover\]",
-    ),
-    "like nothing": (
-        "configurations = ['rover']\n[rover]\nlike = '4W'",
-        r"rover\.like: got 4W; did you mean 4W2T\? allowed: 6T2A, 4W2T",
-    ),
-    "moves on legs": (
-        "configurations = ['rover']\n[rover]\nmovers = 'legs'",
-        r"rover\.movers: got legs; allowed: tracks, wheels",
-    ),
-    "like and movers": (
-        "configurations = ['rover']\n[rover]\nlike = '4W2T'\nmovers = 'wheels'",
-        r"rover: like and movers contradict each other; give one of them",
-    ),
-    "parameters missing": (
-        "configurations = ['rover']\n[rover]\nmovers = 'wheels'\nmass = 3\n[rover.track]\nguide_share = 0",
-        r"rover: with movers instead of like, the configuration must be described completely; track\.loss_coulomb, track\.loss_viscous, "
-        r"ground\.friction\.static, ground\.friction\.dynamic, ground\.rolling_resistance, radius, inertia are missing",
-    ),
-    "no sides": ("sides = 0", r"sides: got 0; expected a whole number, 1 to 12 \(motors with the same command\)"),
-    "half a side": ("sides = 2.5", r"sides: got 2\.5; expected a whole number"),
-    "sides as a boolean": ("sides = true", r"sides: got True; expected a whole number"),
-    "cells as a word": ("[battery]\ncells = 'x'", r"battery\.cells: got 'x'; expected a whole number, 1 to 100"),
-    "a configuration that is not there": (
-        "configurations = ['4W2T']\n[tracked]\nmass = 12",
-        r"tracked\.mass: no such parameter; allowed: battery, motor, gearbox, 4W2T",
-    ),
-    "a switch as a number": (
-        "[gearbox]\nmesh_theory = 1",
-        r"mesh_theory: got 1; expected true or false \(efficiency",
-    ),
-    "a switch as a word": ("[driver]\nreturns_current = 'no'", r"returns_current: got 'no'; expected true or false"),
-    "no such decay": (
-        "[driver]\ndecay = 'coast'",
-        r"driver\.decay: got 'coast'; expected slow or fast \(between pulses",
-    ),
-    "decays": ("[driver]\ndecay = ['fast']", r"driver\.decay: got \['fast'\]; expected slow or fast"),
-    "negative rating": (
-        "[gearbox]\ntorque_limit = -1",
-        r"gearbox\.torque_limit: got -1; expected a number, 0\.001 to",
-    ),
-    "rating with its meaning": (
-        "[motor]\nvoltage_limit = -3",
-        r"motor\.voltage_limit: got -3; expected a number, 0\.1 to 1000 V \(highest",
-    ),
-    "rating as a word": (
-        "[motor]\nspeed_limit = 'fast'",
-        r"motor\.speed_limit: got 'fast'; expected a number, 1 to 1",
-    ),
-    "cut off while it is charged": (
-        "[battery]\nvoltage_cutoff = 4.5",
-        r"battery\.voltage_cutoff: got 4\.5; expected less than voltage_charge, 4\.2 V",
-    ),
-    "rating as a boolean": (
-        "[battery]\ncurrent_charge = true",
-        r"battery\.current_charge: got True; expected a number",
-    ),
-    "not TOML": ("motor = [", r"not a readable TOML file"),
-    "friction speeds reversed": (
-        "[6T2A.ground.friction]\nspeed_static = 0.5\nspeed_dynamic = 0.1",
-        r"6T2A\.ground\.friction\.speed_dynamic: got 0\.1; expected more than speed_static, 0\.5",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_bad_robots_are_refused_in_one_sentence(tmp_path, case):
-    text, sentence = REFUSED[case]
-    with refused(sentence, BadConfiguration):
-        read_rig(tmp_path, text)
 
 
 def test_ratings_are_stated_written_and_checked(tmp_path):

@@ -18,7 +18,6 @@ from tests.commands import read_table, refused, text_file
 HEADER = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
 )
-SEMICOLONS = HEADER.replace(",", ";")
 ROW = "6T2A,15,13.1,0,5,2.75,4800,400"
 
 
@@ -168,73 +167,6 @@ def test_conditions_alone_suffice_where_nothing_is_compared(tmp_path, robot):
         records.read_runs(path)
 
 
-REFUSED = {
-    "empty file": ("", r"runs\.csv: the file is empty; expected a header with configuration"),
-    "blank lines": ("\n\n", r"the file is empty"),
-    "no rows": (HEADER, r"a header without rows"),
-    "missing column": (
-        HEADER.replace(",slope_deg", "") + "\n6T2A,15,13.1,0,2.75,4800,400",
-        r"runs\.csv: column slope_deg is missing \(required: configuration",
-    ),
-    "misspelt column": (
-        HEADER.replace("slope_deg", "slope_degr") + "\n" + ROW,
-        r"slope_deg is missing; did you mean slope_degr",
-    ),
-    "misspelt optional column": (f"{HEADER},total_current_sd_AA\n{ROW},1", r"did you mean total_current_sd_A"),
-    "repeated column": (f"{HEADER},slope_deg\n{ROW},5", r"column slope_deg is present 2 times"),
-    "extra cell": (f"{HEADER}\n{ROW},7", r"row 1: got 9 cells; the header has 8"),
-    "missing cell": (f"{HEADER}\n{ROW}\n6T2A,15", r"row 2: got 2 cells"),
-    "zero voltage everywhere": (
-        f"{HEADER}\n6T2A,0,13.1,0,5,0,0,0",
-        r"supply_voltage_V is 0 in every row, so nothing drives the motors; expected rows with a command",
-    ),
-    "zero voltage of one that runs": (
-        f"{HEADER}\n{ROW}\n{ROW.replace(',15,', ',0,')}",
-        r"row 2, motor_speed_rpm: got 4800 although supply_voltage_V is 0; give the command that drives it, or remove the row",
-    ),
-    "unknown surface": (
-        f"{HEADER},surface\n{ROW},ice",
-        r"surface: got ice; expected one of these; allowed: linoleum",
-    ),
-    "sd of zero": (f"{HEADER},speed_sd_mm_s\n{ROW},0", r"speed_sd_mm_s: got 0; expected more than 0"),
-    "no known channel": (
-        ",".join(HEADER.split(",")[:5]) + "\n6T2A,15,13.1,0,5",
-        r"no column with readings; expected at least one of total_current_A, motor_sp",
-    ),
-    "a reading without its sd": (
-        f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW},",
-        r"row 2, speed_sd_mm_s: got an empty cell next to a reading; expected its sd",
-    ),
-    "thousands with points": (
-        f"{SEMICOLONS}\n6T2A;15;13,1;0;0;2,75;4.800;422",
-        r"runs\.csv, motor_speed_rpm: got 4\.800 next to 13,1 in total_mass_kg; expected decimal",
-    ),
-    "thousands with commas": (
-        f"{SEMICOLONS}\n6T2A;15;13.1;0;0;2.75;4,800;422",
-        r"motor_speed_rpm: got 4,800 next to 13.1 in total_mass_kg; expected decimal",
-    ),
-    "thousands next to whole numbers": (
-        f"{SEMICOLONS}\n6T2A;15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
-        r"motor_speed_rpm: got 4\.800 next to whole numbers below a thousand; .* without thousands separators",
-    ),
-    "commas and points in one column": (
-        f"{SEMICOLONS}\n6T2A;15;13.1;0;5;2,75;4800;400\n6T2A;33;21.1;8;0;3.2;11590;970",
-        r"runs\.csv, total_current_A: got 2,75 and 3\.2; expected decimal commas or decimal points",
-    ),
-    "payload above total": (
-        f"{HEADER}\n6T2A,15,5,8,5,2.75,4800,400",
-        r"total_mass_kg: got 5; expected more than the payload of 8",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_bad_tables_are_refused_in_one_sentence(tmp_path, case):
-    text, sentence = REFUSED[case]
-    with refused(sentence):
-        read(tmp_path, text)
-
-
 # --- as spreadsheets and people write them -----------------------------------------------------------
 
 
@@ -282,53 +214,6 @@ def test_copies_of_rows_are_said(tmp_path):
         plain.notes == ()
         and "runs.csv: rows 1 and 3 have the same conditions and readings, as do 1 more. " in copied.notes[0]
     )
-
-
-@pytest.mark.parametrize(
-    "column, cell, says",
-    [
-        (
-            "supply_voltage_V",
-            "24V",
-            "got 24V; write 24, since the unit is in the column's name; expected a number, -100",
-        ),
-        ("supply_voltage_V", "24 volts", "got 24 volts; write 24, since the unit is in"),
-        (
-            "supply_voltage_V",
-            "24000",
-            r"got 24000; is it in mV\? then name the column supply_voltage_mV; expected -100",
-        ),
-        (
-            "total_current_A",
-            "2750 mA",
-            "write numbers without units, in A, or name the column total_current_mA; expected a num",
-        ),
-        (
-            "total_current_A",
-            "275000",
-            r"is it in mA\? then name the column total_current_mA; expected -2000 to 2000",
-        ),
-        ("payload_kg", "1500", r"is it in g\? then name the column payload_g; expected 0 to 300"),
-        ("payload_kg", "1500 g", "write numbers without units, in kg, or name the column payload_g"),
-        ("slope_deg", "5 %", "write numbers without units, in deg, or name the column slope_percent"),
-        ("slope_deg", "5 furlongs", "write only the number, in deg; expected a number, -45 to 45"),
-        ("slope_deg", "nan", "got nan; expected -45 to 45"),
-        ("motor_speed_rpm", "--", "leave the cell empty if there is no reading; expected a number"),
-        ("slope_deg", "95", r"got 95; is it in percent\? then name the column slope_percent; expected -45 to 45"),
-        ("slope_deg", "", "got an empty cell; expected a"),
-        ("total_mass_kg", "-13.1", r"got -13\.1; expected 0\.1 to 500"),
-        ("supply_voltage_V", "NA", "got NA; expected a number"),
-        ("motor_speed_rpm", "48_00", "got 48_00; .*expected a number"),
-        ("motor_speed_rpm", "inf", "got inf"),
-        ("motor_speed_rpm", "fast", r"got fast; expected a number, -1e\+06"),
-        ("configuration", "", "got an empty cell; expected the name of one of the robot's configurations"),
-        ("motor_speed_rpm", "1e9", r"got 1e9; expected -1e\+06 to 1e\+06"),
-    ],
-)
-def test_a_cell_that_cannot_be_is_refused_with_a_hint(tmp_path, column, cell, says):
-    row = dict(zip(HEADER.split(","), ROW.split(","), strict=True)) | {column: cell}
-    with refused(rf"^runs\.csv row 1, {column}: .*{says}"):
-        read(tmp_path, f"{HEADER}\n{','.join(row.values())}\n")
 
 
 def test_all_bad_cells_are_said_at_once_the_first_row_first(tmp_path):

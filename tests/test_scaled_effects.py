@@ -13,7 +13,6 @@ from worlds import rigs
 import mmrjax as mm
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import loop_input, scales
 from mmrjax import effects
 from mmrjax.effects.base import amplitude_of, free_shape_parameter, scaled_effect
@@ -21,7 +20,7 @@ from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model import paper_robots, params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
-from tests.commands import read_rig, read_table, refused
+from tests.commands import read_rig, read_table
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.
 RIGS = [("bench", "voltage"), ("linear", "motor_speed"), ("wheeled", "voltage")]
@@ -187,12 +186,6 @@ def test_one_class_for_the_same_factors():
         is scaled_effect(kind, (2.0, 1.0, 2.0))
         is not scaled_effect(kind, (3.0, 1.0, 3.0))
     )
-
-
-@pytest.mark.parametrize("stated", ["3", "[1, 2]", "[1, 2, 0]", '[1, 2, "x"]'])
-def test_factors_are_three_positive_numbers(tmp_path, stated):
-    with refused(r"effects\.churning\.scaled: got .* expected three factors above 0", BadConfiguration):
-        read_rig(tmp_path, f"[effects.churning]\nscaled = {stated}\namplitude = 0.0\n", "robot.toml")
 
 
 @pytest.mark.slow

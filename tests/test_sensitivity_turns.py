@@ -7,14 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import mmrjax as mm
-from calibration.data.input_errors import BadConfiguration
 from calibration.sensitivity import uncertain_inputs
 from calibration.sensitivity.model import chosen_outputs
 from mmrjax.derived import turning_figures
 from mmrjax.model import paper_robots, params
 from sweeps import config
 from sweeps.commands import sensitivity as room
-from tests.commands import ends, refused, rows
+from tests.commands import ends, rows
 
 ROBOT = paper_robots.nominal()
 TURNS = ROBOT.showing_turns()
@@ -29,19 +28,6 @@ def test_turns_have_outputs_of_both_sides_of_the_yaw_and_of_the_radius():
     assert {"yaw_rate", "lateral_speed", "motor_current_left", "motor_current_right", "turning_radius"} < {*usual}
     assert "steepest_slope" not in usual and "total_current" in usual
     assert "turning_radius" not in names(chosen_outputs((), ROBOT))
-
-
-@pytest.mark.parametrize("name", ["yaw_rate", "motor_current_left", "turning_radius"])
-def test_outputs_of_turns_are_refused_of_straight_travel_with_what_turns_it(name):
-    with refused(f"{name}: the robot travels straight; .* --vary duty_left=0.2:0.8", BadConfiguration):
-        chosen_outputs((name,), ROBOT)
-    assert names(chosen_outputs((name,), TURNS, turns=True)) == [name]
-
-
-@pytest.mark.parametrize("name", ["start", "peak_current", "steepest_slope"])
-def test_outputs_of_straight_travel_are_refused_of_turns(name):
-    with refused(f"--outputs {name}: only for straight travel", BadConfiguration):
-        chosen_outputs((name,), TURNS, turns=True)
 
 
 def test_turns_have_inputs_of_turns():

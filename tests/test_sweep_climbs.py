@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 import zarr
 from pages import Tables, drawn
-from pydantic import ValidationError
 
-from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing.climb_simulation import NAMES, OVER, SLIDES, TIPS
 from mmrjax.fidelities.variation import STATUS, Variation
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
-from sweeps.config_campaign import Campaign, Obstacle
+from sweeps.config_campaign import Obstacle
 from sweeps.pages.sweep_figures import draw_grid_statuses
-from sweeps.points import axes, scale, tasks
+from sweeps.points import scale, tasks
 from sweeps.report.sweep_report import VariedQuantity
-from tests.commands import ends, read_json, refused
+from tests.commands import ends, read_json
 
 ROBOT = nominal()
 
@@ -39,40 +37,6 @@ def test_search_of_many_points_ends_within_a_millimetre_of_each_ones_limit():
     assert largest[4] > tasks.SOUGHT["step"][1] - tasks.NEAR
     assert [NAMES[k] for k in found[tasks.VERDICT]] == ["slides", "slides", "slides", "tips", "over"]
     assert len(calls) == 10
-
-
-REFUSED = {
-    "no size": ({"kind": "step"}, {"levers_front_deg": [30, 45]}, r"obstacle_mm: got none; expected an axis obstacle_mm"),
-    "a size beside a search": ({"kind": "gap", "find": True}, {"obstacle_mm": [30, 45]}, r"got it; find searches for it"),
-    "a lever below the ground": ({"kind": "step"}, {"levers_front_deg": [-30, 45], "obstacle_mm": [50]},
-                                 r"levers_front_deg: at -30 deg they begin 72 mm below the ground"),
-    "beyond the range": ({"kind": "step"}, {"levers_rear_deg": [190], "obstacle_mm": [50]}, r"expected -180 to 180 deg"),
-    "no size at all": ({"kind": "step"}, {"obstacle_mm": [0]}, r"obstacle_mm: got 0; expected 1 to 5000 mm"),
-    "levers of a wheeled robot": ({"kind": "step"}, {"levers_front_deg": [30], "obstacle_mm": [50], "configuration": ["6T2A", "4W2T"]},
-                                  r"levers_front_deg: 4W2T has no levers; configurations with levers: 6T2A"),
-    "a nose larger than its tread": ({"kind": "stairs", "nose_mm": 100, "tread_mm": 190}, {"obstacle_mm": [250]},
-                                     r"nose_mm: got 100; expected less than half of rise and tread, 95 mm"),
-    "a nose larger than its rise": ({"kind": "stairs", "nose_mm": 40}, {"obstacle_mm": [70, 90]}, r"expected less than .* 35 mm$"),
-    "a name that is none": ({"kind": "step"}, {"obstacle_mm": [50], "friction": [1]}, r"neither a parameter"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
-    of, varied, message = REFUSED[case]
-    with refused(message, BadConfiguration):
-        axes.plan_design(Campaign(obstacle=Obstacle(**of), axes=varied), ROBOT, "map.toml")
-
-
-@pytest.mark.parametrize(
-    "key, value, kind, kinds",
-    [("tread_mm", 300, "step", "stairs"), ("count", 2, "gap", "stairs"), ("nose_mm", 5, "gap", "step or stairs")],
-)
-def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):
-    with pytest.raises(ValidationError, match=f"`{key}` has an effect only with `kind` {kinds}"):
-        Obstacle(kind=kind, **{key: value})
-    # as a file of all keys has them
-    assert Obstacle(**Obstacle(kind=kind).model_dump()) == Obstacle(kind=kind)
 
 
 def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):

@@ -7,14 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from mmrjax.model import paper_robots, params
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes
 from sweeps.points import sampled_design as design
 from sweeps.points.sampled_design import Blocks, Design
-from tests.commands import refused
 
 SCIPY = {
     "uniform": ({"low": 2.0, "high": 6.0}, stats.uniform(2, 4)),
@@ -210,66 +208,7 @@ def test_points_of_blocks_are_those_of_the_whole(nominal):
 
 # --- what is refused ------------------------------------------------------------------------------------------
 
-RANGE = {"start": 0, "stop": 20, "number": 5}
-UNIFORM = {"distribution": "uniform", "low": 0, "high": 8}
-SAMPLES = {"design": "sobol", "number": 8, "over": {"payload": UNIFORM}}
-BAD = {
-    "unknown name": ({"axes": {"slope": [1]}}, r"plan\.toml, axes\.slope: neither a parameter of the robot nor a condition; did you mean slope_deg.*allowed: configuration, voltage"),
-    "no values": ({"axes": {"voltage": []}}, r"axes\.voltage: got no values; expected at least one"),
-    "range of none": ({"axes": {"voltage": RANGE | {"number": 0}}}, r"axes\.voltage\.number: got 0; expected a whole number from 1"),
-    "range upside down": ({"axes": {"slope_deg": RANGE | {"start": 30}}}, r"axes\.slope_deg: got start 30, stop 20, number 5; expected start below stop"),
-    "range with a wrong key": ({"axes": {"slope_deg": RANGE | {"steps": 3}}}, r"axes\.slope_deg\.steps: no such key; .*allowed: start, stop, number, scale"),
-    "range without number": ({"axes": {"slope_deg": {"start": 0, "stop": 3}}}, r"axes\.slope_deg: number is missing; expected start, stop, number"),
-    "range on no scale": ({"axes": {"slope_deg": RANGE | {"scale": "sqrt"}}}, r"scale: got 'sqrt'; allowed: linear, log"),
-    "logarithm of zero": ({"axes": {"slope_deg": RANGE | {"scale": "log"}}}, r"start: got 0; expected a number above 0 with scale log"),
-    "steps upside down": ({"axes": {"slope_deg": "20:0:5"}}, r"axes\.slope_deg: got 20:0:5, which ends before it begins; expected first:last:step"),
-    "a word": ({"axes": {"voltage": [15, "high"]}}, r"axes\.voltage: got 'high'; expected a number"),
-    "twice the same": ({"axes": {"voltage": [15, 15]}}, r"axes\.voltage: got a value twice"),
-    "out of bounds": ({"axes": {"slope_deg": [0, 95]}}, r"axes\.slope_deg: got 95; expected -45 to 45 deg \(slope"),
-    "parameter out of bounds": ({"axes": {"motor.resistance": [-1]}}, r"axes\.motor\.resistance: got -1; expected 0"),
-    "unknown configuration": ({"axes": {"configuration": ["8T"]}}, r"axes\.configuration: got '8T'; the robot has no such configuration; allowed: 6T2A, 4W2T"),
-    "nothing varies": ({}, r"plan\.toml: no \[axes\] or \[samples\]"),
-    "stated twice": ({"axes": {"payload": [1]}, "samples": SAMPLES}, r"plan\.toml, payload: given twice"),
-    "also fixed": ({"axes": {"payload": [1]}, "conditions": {"payload": 2}}, r"payload: given twice; give it once, under conditions"),
-    "surface and adhesion": ({"axes": {"adhesion": [1]}, "conditions": {"surface": "asphalt"}}, r"conditions\.surface: got asphalt in addition to adhesion"),
-    "unknown surface": ({"axes": {"payload": [1]}, "conditions": {"surface": "ice"}}, r"conditions\.surface: got 'ice'; allowed: linoleum"),
-    "unknown condition": ({"axes": {"payload": [1]}, "conditions": {"volts": 3}}, r"conditions\.volts: no such condition; did you mean voltage"),
-    "condition out of bounds": ({"axes": {"payload": [1]}, "conditions": {"voltage": 30000}}, r"conditions\.voltage: got 30000; expected -10000 to 10000 V"),
-    "unknown design": ({"samples": SAMPLES | {"design": "halton"}}, r"samples\.design: got 'halton'; allowed: latin_hypercube, sobol, random"),
-    "list of designs": ({"samples": SAMPLES | {"design": ["sobol"]}}, r"samples\.design: got \['sobol'\]; .*allowed: latin_hypercube"),
-    "list of distributions": ({"samples": SAMPLES | {"over": {"payload": UNIFORM | {"distribution": ["uniform"]}}}}, r"payload\.distribution: got \['uniform'\]; .*"),
-    "list of surfaces": ({"axes": {"payload": [1]}, "conditions": {"surface": ["asphalt"]}}, r"conditions\.surface: got \['asphalt'\]; .*"),
-    "truth of a voltage": ({"axes": {"voltage": [True]}}, r"axes\.voltage: got True; expected a number"),
-    "no samples": ({"samples": SAMPLES | {"number": 0}}, r"samples\.number: got 0; expected a whole number from 1"),
-    "negative seed": ({"samples": SAMPLES | {"seed": -1}}, r"samples\.seed: got -1; expected a whole number from 0"),
-    "nothing sampled": ({"samples": {"design": "sobol", "number": 8}}, r"samples: nothing to sample; give a table `over` of names and distributions, or `posterior`"),
-    "unknown key of samples": ({"samples": SAMPLES | {"count": 3}}, r"samples\.count: no such key"),
-    "over is a list": ({"samples": SAMPLES | {"over": ["payload"]}}, r"samples\.over: got \['payload'\]; expected a table"),
-    "unknown distribution": ({"samples": SAMPLES | {"over": {"payload": "gauss"}}}, r"samples\.over\.payload\.distribution: got 'gauss'; allowed: uniform"),
-    "distribution upside down": ({"samples": SAMPLES | {"over": {"payload": UNIFORM | {"low": 9}}}}, r"over\.payload: got low 9, high 8; expected low below high"),
-    "sd of zero": ({"samples": SAMPLES | {"over": {"payload": {"distribution": "normal", "mean": 4, "sd": 0}}}}, r"over\.payload\.sd: got 0; expected more than 0"),
-    "distribution out of bounds": ({"samples": SAMPLES | {"over": {"slope_deg": UNIFORM | {"high": 90}}}}, r"over\.slope_deg: got 90; expected -45 to 45"),
-    "condition has no prior": ({"samples": SAMPLES | {"over": {"payload": "prior"}}}, r"over\.payload: payload has no prior; expected one of uniform"),
-    "sampled configuration": ({"samples": SAMPLES | {"over": {"configuration": UNIFORM}}}, r"over\.configuration: cannot be sampled"),
-    "logarithm from zero": ({"samples": SAMPLES | {"over": {"payload": {**UNIFORM, "distribution": "loguniform"}}}}, r"over\.payload\.low: got 0; expected a number above 0 with loguniform"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_designs_are_refused_with_place_value_and_choices(case, nominal):
-    tables, message = BAD[case]
-    with refused(message, BadConfiguration):
-        planned(nominal, **tables)
-
 
 @pytest.mark.parametrize("stated, values", [([False, True], [0, 1]), (True, [1]), ([0, 1], [0, 1])])
 def test_battery_is_an_axis_of_truth_values_too(nominal, stated, values):
     assert planned(nominal, axes={"battery": stated}).design.axes["battery"].tolist() == values
-
-
-def test_more_points_than_numbers_are_refused(nominal):
-    many = {"start": 1.0, "stop": 2.0, "number": 4_000_000}
-    with refused(r"points; expected at most", BadConfiguration):
-        planned(nominal, axes={n: many for n in ("voltage", "payload", "slope_deg")})
-    with refused(r"number: got 20000000; expected a whole number from 1 to 10000000", BadConfiguration):
-        planned(nominal, axes={"voltage": many | {"number": 20_000_000}})

@@ -2,7 +2,6 @@
 
 import contextlib
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -61,28 +60,6 @@ def test_small_v_s_is_neither_refused_nor_wrong(robot, speed_static):
     assert largest_step(small, runs).min() > 1e-4
     slip = [np.asarray(_simulate_batch(small, runs, 0.5, step, 1e-3, True).result.slip) for step in (1e-4, 1e-5)]
     assert_allclose(slip[0], slip[1], atol=5e-4)
-
-
-@pytest.mark.parametrize(
-    "lever, angle, says",
-    [
-        ("lever_front", -np.pi / 3, "lever_front: got -60 deg, its tip 134 mm below the ground"),
-        ("lever_rear", -np.pi / 3, "lever_rear: got -60 deg, its tip 134 mm below the ground"),
-        # a tip 46 mm below the axles is under the tracks' ground (43.7 mm), though not under the wheels' (50 mm)
-        ("lever_front", -np.arcsin(0.046 / 0.205), "lever_front: got -13 deg, its tip 2 mm below the ground"),
-    ],
-)
-def test_lever_below_the_ground_of_the_tracks_is_refused(robot, lever, angle, says):
-    """Whoever comes first. Where it is stated of a run too."""
-    with pytest.raises(ValueError, match=says):
-        track_batch(params.replace(robot, {f"running_gear.{lever}": angle}), jax.tree.map(lambda x: x[::-1], TWO))
-    degrees = {
-        "levers_front_deg": 180.0,
-        "levers_rear_deg": 180.0,
-        f"{lever.replace('lever', 'levers')}_deg": np.degrees(angle),
-    }
-    with pytest.raises(ValueError, match=says.replace("lever", "levers", 1).replace(":", "_deg:", 1)):
-        track_batch(robot, Conditions(**degrees))
 
 
 @pytest.mark.parametrize("limit", [2.6e-4, 1.0999e-4, 1e-4, 3.7e-6, 0.5])

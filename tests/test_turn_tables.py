@@ -134,35 +134,6 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
     ).unknown == ("yaw_rate_rad_s",)
 
 
-@pytest.mark.parametrize(
-    "sides, says",
-    [
-        (
-            "left_V,right_V",
-            r"column left_V: .* voltage of the left side, rename it to voltage_left_V, or set \[columns\] voltage_left_V = "
-            '"left_V" in',
-        ),
-        (
-            "U_right_V,U_left_V",
-            r"column U_right_V: .* rename it to voltage_right_V, or set \[columns\] voltage_right_V",
-        ),
-        (
-            "motor_voltage_left_V,motor_voltage_right_V",
-            r"supply_voltage_V is missing; .* \[columns\]: voltage_left_V = \"motor_voltage_left_V\", voltage_right_V",
-        ),
-        (
-            "U_1,U_2",
-            "row 2, motor_current_left_A: got -2 at 24 V; nothing else drives .*; for a turn, give duty_left and duty_right",
-        ),
-    ],
-)
-def test_a_table_of_turns_without_what_drives_the_sides_is_told_what_to_add(rig, table, sides, says):
-    rows = [(24, 5, 10, 3.0, 9.0, 0.3), (24, 2, 10, -2.0, 9.0, 0.6)]
-    supply = "supply" if sides.startswith("motor") else "supply_voltage_V"
-    with refused(says):
-        table(f"{supply},{sides},{READ}", *rows, robot=rig(DRIVEN))
-
-
 #: Of SOUND, at 0.012 V/rpm.
 VOLTS = [(0.012 * row[0], 0.012 * row[1], *row) for row in SOUND]
 
@@ -210,47 +181,12 @@ def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_
         records.read_runs(path, measured=False, battery=True)
 
 
-@pytest.mark.parametrize(
-    "header, row, says",
-    [
-        ("voltage_left_V", (3,), "column voltage_right_V is missing although voltage_left_V is present; give the command of both"),
-        ("voltage_left_V,voltage_right_V,duty_left,duty_right", (3, 6, 0.5, 1), "column duty_left in addition to voltage_left"),
-        ("voltage_left_V,voltage_right_V,duty", (3, 6, 1), "column duty in addition to voltage_left_V, .* keep one"),
-        ("voltage_left_V,voltage_right_V,supply_voltage_V", (3, 13, 12), "row 2, voltage_right_V: got 13 V at a supply "
-         "of 12 V; expected no more than supply_voltage_V, or remove that column"),
-        ("voltage_left_V,voltage_right_V", ("", 3), "row 2, voltage_left_V: got an empty cell; expected a number, -100"),
-    ],
-)  # fmt: skip
-def test_voltages_of_the_sides_that_cannot_be_are_refused(rig, table, header, row, says):
-    sound = {"supply_voltage_V": 12, "duty": 1, "duty_left": 1, "duty_right": 1}
-    first = [sound.get(name, 6) for name in header.split(",")]
-    with refused(says):
-        table(f"{header},{SPEEDS}", (*first, 0, 900), (*row, 0, 900), robot=rig(DRIVEN))
-
-
 @pytest.mark.parametrize("row, zero", [((0, 1, 0.4), "supply_voltage_V"), ((24, 0, 0), "duty_left and duty_right")])
 def test_a_turn_that_nothing_drives_is_left_out_with_a_note(rig, table, row, zero):
     header = f"supply_voltage_V,duty_left,duty_right,{SPEEDS}"
     found = table(header, (24, 0, 1, 0, 900), (*row, 0, 0), robot=rig(DRIVEN))
     assert len(found) == 1
     assert f"turns.csv: row 2 is left out, since nothing drives the motors ({zero} is 0). " in found.notes[0]
-
-
-@pytest.mark.parametrize("of_turns", ["duty_left,duty_right", "heading_deg,duty_left,duty_right", "heading_deg"])
-def test_readings_of_turns_on_a_slope_are_refused_with_what_follows_them(tmp_path, rig, table, of_turns):
-    robot, each = rig(DRIVEN), [1] * len(of_turns.split(","))
-    header = f"supply_voltage_V,slope_deg,{of_turns},{SPEEDS}"
-    rows = [(24, slope, *each, 900, 900) for slope in (0, 5, -3)]
-    with refused(r"row 2, slope_deg: got 5 in a table of settled turns, as in 2 of 3 .* drive"):
-        table(header, *rows, robot=robot)
-    assert len(table(header, rows[0], robot=robot)) == 1
-    assert records.read_runs(
-        text_file(
-            tmp_path / "asked.csv", f"supply_voltage_V,slope_deg,{of_turns}\n24,5,{','.join(map(str, each))}\n"
-        ),
-        measured=False,
-        robot=robot,
-    ).turns
 
 
 @pytest.mark.parametrize(
@@ -281,48 +217,6 @@ def test_currents_without_sign_are_compared_as_magnitudes(rig, table):
     assert any("magnitudes are compared" in note for note in runs.notes)
     signed = table(f"{SPEEDS},{READ}", *SOUND, robot=robot)
     assert with_inferred_instruments(robot, signed) is robot
-
-
-def row_of(*changes):
-    """Rows with columns in another order, or of another sign."""
-    return [tuple(sign * row[k] for k, sign in changes) for row in SOUND]
-
-
-KEEP = tuple((k, 1) for k in range(5))
-REFUSED = {
-    "one side": (KINEMATIC, f"motor_speed_left_rpm,{READ}", row_of(KEEP[0], *KEEP[2:]),
-                 "column motor_speed_right_rpm is missing although motor_speed_left_rpm is present"),
-    "one duty": (DRIVEN, f"supply_voltage_V,duty_left,{READ}", [(24, 1, *row[2:]) for row in SOUND],
-                 "column duty_right is missing although duty_left is present"),
-    "both ways": (KINEMATIC, f"motor_speed_rpm,{SPEEDS},{READ}", [(1, *row) for row in SOUND],
-                  "column motor_speed_rpm in addition to motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
-    "letters": (KINEMATIC, f"{SPEEDS},motor_current_l_A,motor_current_r_A,yaw_rate_rad_s", SOUND,
-                "column motor_current_l_A: the sides are called left and right; rename it to motor_current_left_A"),
-    "in front": (KINEMATIC, f"{SPEEDS},left_motor_current_A,right_motor_current_A,yaw_rate_rad_s", SOUND,
-                 r"rename it to motor_current_left_A, or set \[columns\]"),
-    "duties by letters": (DRIVEN, f"supply_voltage_V,duty_L,duty_R,{READ}", [(24, 1, 1, *r[2:]) for r in SOUND],
-                          "column duty_L: the sides are called left and right; rename it to duty_left"),
-    "yaw to the right": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:4], (4, -1)),
-                         r"row 4, yaw_rate_rad_s: got -0.9 although .* at -1500 and 1500 rpm \(as in 5 of 5 rows\); "
-                         "expected a positive value if the right side is faster"),
-    "currents exchanged": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:2], (3, 1), (2, 1), KEEP[4]),
-                           r"row 4, motor_current_left_A and motor_current_right_A: got 8 and -8 .* exchanged"),
-    "duties exchanged": (DRIVEN, f"supply_voltage_V,duty_left,duty_right,{SPEEDS}",
-                         [(24, b / 2000, a / 2000, a, b) for a, b, *_ in SOUND],
-                         "motor_speed_left_rpm and motor_speed_right_rpm: .* left and right columns of one quantity are"),
-    "no width": (KINEMATIC.replace('width = "0.555 ± 5 %"\n', ""), f"{SPEEDS},{READ}", SOUND,
-                 r"the robot's file lacks rover.turning.width \[m\], needed for a turn"),
-    "one motor": (KINEMATIC.replace("sides = 2", "sides = 1"), f"{SPEEDS},{READ}", SOUND,
-                  "got a robot of 1 side; expected sides = 2"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_bad_tables_of_turns_are_refused_in_a_sentence(rig, table, case):
-    content, header, rows, sentence = REFUSED[case]
-    robot = rig(content)
-    with refused(sentence):
-        table(header, *rows, robot=robot)
 
 
 def test_gearbox_loses_though_no_inertia_is_stated(rig):

@@ -10,19 +10,14 @@ from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from calibration.data import rig_facts, robot_file
-from calibration.data.input_errors import BadConfiguration
-from calibration.sensitivity.model import chosen_outputs, default_outputs
 from mmrjax.fidelities.base import History
 from mmrjax.missions.profile import profile
 from mmrjax.model import params
 from mmrjax.model.quantities import HEAT, WARMING
 from mmrjax.model.signals import Signals
 from sweeps.config import Simulate
-from sweeps.config_campaign import Campaign
 from sweeps.inputs import load_robot
-from sweeps.points import axes
-from sweeps.points.job import prepare_job
-from tests.commands import ends, read_rig, refused
+from tests.commands import ends, read_rig
 from tests.pages import Tables
 
 MOTOR = "[motor]\ntorque_constant = 0.03\n{more}[gearbox]\nratio = 20\nefficiency_load = 0.8\n"
@@ -155,13 +150,6 @@ def test_a_parameter_that_is_set_is_known(tmp_path):
     assert params.replace(robot, {"motor.resistance": 2.0}).unknown(HEAT) == HEAT[2:]
 
 
-def test_a_study_of_what_is_unknown_is_refused(tmp_path):
-    robot = read(tmp_path, BENCH, "motor_speed")
-    assert default_outputs(robot, False) == ("output_torque",)
-    with refused(r"power_supply: not known, as .* does not state motor\.resistance$", BadConfiguration):
-        chosen_outputs(("power_supply",), robot)
-
-
 @pytest.mark.slow
 def test_commands_leave_out_what_is_unknown_and_say_so(mmrjax, tmp_path):
     read(tmp_path, BENCH, "motor_speed")
@@ -171,15 +159,3 @@ def test_commands_leave_out_what_is_unknown_and_say_so(mmrjax, tmp_path):
     assert columns.isdisjoint(head.split(",")) and "power_motor_W" in head
     note = "cannot be computed: the robot's file does not give motor.resistance, "
     assert note in " ".join(out.split()) and note in Tables((tmp_path / "run/report.html").read_text("utf-8")).text
-
-
-@pytest.mark.parametrize("varied", [{}, {"motor.resistance": [0.5, 1.0]}], ids=["none", "resistance"])
-def test_a_store_of_what_is_unknown_is_refused_unless_it_varies(tmp_path, varied):
-    robot = read(tmp_path, BENCH, "motor_speed")
-    config = Campaign(axes={"motor_speed": [100.0, 200.0], **varied}, outputs=("power_supply",), chunk=4)
-    plan = axes.plan_design(config, robot, "map.toml")
-    if not varied:
-        with refused(r"power_supply cannot be computed, because .* lacks motor\.resistance$", BadConfiguration):
-            prepare_job(config, robot, plan, "map.toml")
-    else:
-        assert prepare_job(config, robot, plan, "map.toml").outputs == ("power_supply",)

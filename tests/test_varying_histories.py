@@ -336,25 +336,6 @@ def test_columns_of_the_driver_are_read(tmp_path, robot):
     assert set(DRIVEN) <= set(MODES)
 
 
-@pytest.mark.parametrize(
-    "header, row, says",
-    [
-        (f"{HEADER},mode", "a,0,6T2A,24,0,0,0,11,reverse",
-         r"row 1, mode: got reverse; expected one of these; .*voltage, brake, coast"),
-        (f"{HEADER},duty", "a,0,6T2A,24,0,0,0,11,2", r"row 1, duty: got 2; expected -1 to 1"),
-        (f"{HEADER},duty", "a,0,6T2A,24,0,0,0,11,", r"row 1, duty: got an empty cell; expected a number from -1 to 1"),
-        (f"{HEADER},duty,mode", "a,0,6T2A,24,0,0,0,11,0.3,brake",
-         r"row 1, duty: got 0.3 in mode brake; expected 0 or an empty cell"),
-        (HEADER, "a,0,6T2A,-10001,0,0,0,11", r"row 1, supply_voltage_V: got -10001; expected -10000 to 10000"),
-        (f"{HEADER.replace('time_s', 'order')},mode", "a,0,6T2A,24,0,0,0,11,brake",
-         r"column mode is for time histories; add time_s, or remove it"),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_is_said_in_one_sentence(tmp_path, header, row, says):
-    with refused(says):
-        read_table(tmp_path, f"{header}\n{row}")
-
-
 def test_what_cannot_change_within_a_run_is_refused(runs):
     other = np.where(np.arange(len(runs)) % 2, "6T2A", "4W2T")
     with refused(r"configuration: run coasting has several values; give each its own run_id"):
