@@ -208,16 +208,6 @@ def test_battery_standing_still_lasts_its_capacity_over_the_other_consumers_curr
     assert found.total.time == pytest.approx(7920.0 / 1.5, rel=1e-9)
 
 
-@pytest.mark.slow
-def test_cells_that_stay_below_their_cut_off_end_the_mission(robot):
-    weak = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=3.9))
-    found = run(weak, asked(battery=1.0, discharge=2500.0), rows([0, 3600]))
-    assert "cut_off" in flagged(found.result.flags) and STATUSES[int(found.result.status)] == "cut_off"
-    assert found.total.time < 1000.0
-    started = run(robot, asked(battery=1.0), rows([0, 5]))  # the inrush alone does not count
-    assert float(started.peaks["cell_low"]) < 3.0 and "cut_off" not in flagged(started.result.flags)
-
-
 def test_a_demand_that_cannot_be_met_is_followed_as_far_as_possible_and_flagged(robot):
     found = run(robot, asked(), rows([0, 5], "speed", demand=2.0))
     assert "demand_missed" in flagged(found.flags[0, 0])

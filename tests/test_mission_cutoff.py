@@ -18,7 +18,7 @@ from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.signals import STATUSES
-from tests.commands import ends, read_json, rows
+from tests.commands import rows
 
 HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
 #: Room for the steps of a mission, as the command keeps; one program serves all with the same cut-off.
@@ -157,39 +157,10 @@ def test_charge_that_is_off_shows_in_what_is_unaccounted_for(cut):
 # --- what is said ---------------------------------------------------------------------------------------------------
 
 
-def written(folder, cutoff):
-    (folder / "low.toml").write_text(f"[battery]\nvoltage_cutoff = {cutoff}\n")
-    (folder / "hour.csv").write_text("time_s,duty,slope_deg,payload_kg\n0,1,10,5\n3600,1,10,5\n")
-    return "simulate", "--robot", "low.toml", "--profile", "hour.csv", "--battery"
-
-
 @pytest.fixture(scope="module")
 def tmp_path(tmp_path_factory):
     """One folder for all commands of this file."""
     return tmp_path_factory.mktemp("cutoff")
-
-
-@pytest.fixture
-def run_folder(tmp_path, mmrjax):
-    if not (tmp_path / "a").exists():
-        _, out, err = ends(mmrjax(*written(tmp_path, 3.3), "--no-report", "--out", "a"), code=0)
-        (tmp_path / "out.txt").write_text(out)
-        (tmp_path / "err.txt").write_text(err)
-    return tmp_path / "a"
-
-
-@pytest.mark.slow
-def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
-    out, err = ((run_folder.parent / f"{name}.txt").read_text() for name in ("out", "err"))
-    result = read_json(run_folder / "result.json")
-    left = 100 * result["state_of_charge"]
-    assert result["status"] == "cut_off" and "cut_off" in result["flags_raised"]
-    assert "no charge left" not in out and f"ended with {left:.1f} % of the charge left" in " ".join(out.split())
-    assert "3.3 V is below the 3.41 V of an empty cell without load: it acts only beyond 2.22 A" in " ".join(
-        err.split()
-    )
-    history = rows(run_folder / "history.csv")
-    assert history[-1]["event"] == "cut_off" and "below_cut_off" in [row["event"] for row in history]
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pages import Tables
 from test_documents import check, comparison, size
 
 from calibration.described import describe
-from calibration.discovery.loop_notes import AlternativeValue, Headline
+from calibration.discovery.loop_notes import Headline
 from calibration.words import loop_words
 from sweeps.report import page_renderer, terminal_renderer
 from sweeps.report.document import plain_text
@@ -53,17 +53,6 @@ def test_the_answer_of_the_loop_is_the_claim_that_holds_at_every_noise(level):
     assert ("established" in answer) == (level in ("mechanism", "place"))
     alone = describe(dataclasses.replace(found, factors=(1.0,)))
     assert "times the noise" not in alone and alone[:2] == answer[:2]
-
-
-def test_the_answer_states_a_value_that_may_be_wrong_before_the_effect_that_imitates_it():
-    value = AlternativeValue("gearbox.efficiency_load", 0.685, "-")
-    found = Headline(
-        "class", (("gear_load_loss",),), (1.0,), (), (("loss torque that changes with load",),), ((value,),)
-    )
-    assert describe(found) == (
-        "No: a loss torque that changes with load (gearbox.efficiency_load is 0.685 or gear_load_loss, "
-        "which these data cannot distinguish) is missing."
-    )
 
 
 def test_a_parameter_that_moved_is_stated_with_its_ratio():

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from calibration.data.input_errors import BadConfiguration
 from sweeps import cli, config, config_campaign, options
-from tests.commands import ends, refused
+from tests.commands import ends
 
 KINDS = {
     "simulate": (config.Simulate, config.OneRun),
@@ -70,20 +69,6 @@ def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_s
     assert {"config_file", "no_cache"} <= set(parameters[command])
 
 
-def test_units_bounds_choices_and_defaults_are_read_off_the_field():
-    def text(kind, name):
-        return options.option_help(name, options.schema_facts(kind)[name]).replace("\\", "")
-
-    assert text(config.Sweep, "slopes_deg").endswith("  [-45 to 45]  [default: 0,5,10,15,20]")
-    assert text(config.Sweep, "discharge_mAh") == (
-        "Charge taken from the battery before (mAh).  [0 to 100000]  [default: 0]"
-    )
-    assert text(config.Resonance, "payloads_kg").endswith("[default: 0,1.5,3,5,6.5,8]")
-    assert "[above 0, at most 0.01]  [default: 0.0001]" in text(config.Simulate, "step_s")
-    assert text(config.Simulate, "battery") == "Use the robot's battery."
-    assert text(config.Simulate, "report") == "Write report.html.  [default: report]"
-
-
 @pytest.mark.parametrize("command", KINDS)
 def test_help_shows_few_options_and_help_all_every_one(command, parameters, said):
     """Those that the command calls common, so that a name that is no option fails."""
@@ -99,44 +84,12 @@ def test_help_shows_few_options_and_help_all_every_one(command, parameters, said
     assert said(command, "--help") == short  # nothing is left of it
 
 
-def _file(folder, text):
-    (folder / "c.toml").write_text(text)
-    return folder / "c.toml"
-
-
 def test_keys_of_a_file_are_read_and_options_win(tmp_path):
-    file = _file(tmp_path, "seed = 3\nreplicates = 300\nrows = 800\n")
+    file = tmp_path / "c.toml"
+    file.write_text("seed = 3\nreplicates = 300\nrows = 800\n")
     found = config.resolve_configuration(config.Loop, file, {})
     assert (found.seed, found.replicates, found.rows) == (3, 300, 800)
     assert config.resolve_configuration(config.Loop, file, {"rows": 1600}).rows == 1600
-
-
-def test_configuration_of_one_command_names_what_another_lacks(tmp_path, monkeypatch, said):
-    monkeypatch.chdir(tmp_path)
-    _file(tmp_path, 'model = "drive"\nduration_s = 0.0\n')
-    assert said("compare", "--config", "c.toml").startswith("mmrjax: c.toml, duration_s: got 0.0; ")
-    assert said("check", "--config", "c.toml").startswith("mmrjax: c.toml, model: no such key; ")
-
-
-def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
-    """Every message of a configuration's own rules has its fields between backticks, and those that differ from their
-    option are called by it. From a file by their key."""
-    source = Path(config.__file__).read_text(encoding="utf-8")
-    rules = re.findall(r'\bidle\(\s*(f?"(?:[^"]|"\s*f?")*")', source)
-    tables = [
-        part.exclusive + part.needed for kinds in KINDS.values() for kind in kinds for part in kind.__mro__[:-2]
-    ]
-    rules += [text for table in tables for _, _, *texts in table for text in texts]
-    fields = {n for kinds in KINDS.values() for k in kinds for n in options.options_of_fields(k) if "_" in n}
-    assert len(rules) > 15 and [r for r in rules for n in fields if re.search(rf"(?<![`\w]){n}(?![`\w])", r)] == []
-    given = {"left_V": 5.0, "battery": True}
-    with refused(r"^--left needs --right; give both$", BadConfiguration):
-        config.resolve_configuration(config.Simulate, None, given)
-    (tmp_path / "a.toml").write_text("left_V = 5.0\n")
-    with refused(r"^a\.toml: left_V needs right_V; give both$", BadConfiguration):
-        config.resolve_configuration(config.Simulate, tmp_path / "a.toml", {})
-    with refused(r"^--left: got 50000\.0; ", BadConfiguration):
-        config.resolve_configuration(config.Simulate, None, {"left_V": 50000.0, "right_V": 1.0})
 
 
 HARM = "import pathlib\npathlib.Path('harmed').touch()\n"

@@ -1,12 +1,10 @@
 """What pages say of limits, scales and tables: what is judged, by which measure, and that nothing overruns."""
 
 import dataclasses
-import re
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from test_documents import size
 
 import mmrjax as mm
 from calibration.data import runs as records
@@ -77,13 +75,6 @@ def test_ticks_of_a_map_are_round_numbers_at_their_places(levels, ticks):
     assert_allclose(np.interp(list(seen.values()), np.arange(levels.size), levels), [float(t) for t in ticks])
 
 
-def test_every_table_of_a_page_scrolls_in_itself(tmp_path):
-    text = page_renderer.write_report_page(tmp_path, size()).read_text("utf-8")
-    tables = re.findall(r"(.{0,24})<table", text)
-    assert len(tables) > 1 and all(before.endswith('"scroll" tabindex="0">') for before in tables)
-    assert text.count("</table></div>") == len(tables) and ".scroll { overflow-x: auto; }" in text
-
-
 def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
     """The warning comes before the contents."""
     curved = dataclasses.replace(robot, effects=(effects.UNNAMED["curve_electrical_current"](), effects.ALL[0]()))
@@ -96,14 +87,6 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
             assert (
                 0 < warning < text.index("<code>curve_electrical_current</code>") < text.index('<nav id="contents"')
             )
-
-
-def test_a_chart_of_corners_does_not_warn_of_the_cut_off():
-    """A warning went to the terminal, between the lines of `size`."""
-    robot = paper_robots.nominal()
-    robot = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=2.5))
-    corner = {"configuration": "4W2T", "payload_kg": 0.0, "slope_deg": 5.0, "state_of_charge": 0.5}
-    assert drive_curves.chart_of_corners(robot, [corner])[2] is not None
 
 
 def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox(robot):

@@ -1,7 +1,6 @@
 """Packaged parts: every value has a source, and each sheet agrees with itself."""
 
 import math
-import tomllib
 
 import pytest
 
@@ -9,7 +8,6 @@ from calibration.sizing import part_options
 from mmrjax.effects.voltage_effects import ThermalDrift
 from mmrjax.model.gearmotor import Gearbox, Motor
 from mmrjax.model.power import Battery
-from tests.commands import ROOT
 
 TABLES = ("motors", "gearboxes", "cells")
 #: What a motor has to state to be sized with.
@@ -132,9 +130,3 @@ def test_parts_cells_weigh_what_cells_weigh():
     for cell in weighed:
         grams_per_amp_hour = 1e3 * cell.weight / cell.cells / (cell.capacity / 3600)
         assert 13 < grams_per_amp_hour < 30, cell.name
-
-
-def test_parts_are_package_data():
-    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]["package-data"]
-    packed = {p.name for pattern in patterns["calibration"] for p in (ROOT / "calibration").glob(pattern)}
-    assert {f"{table}.csv" for table in TABLES} <= packed

@@ -11,14 +11,13 @@ from numpy.testing import assert_array_equal
 
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.writing import json_value
 from calibration.inference import identifiability, noise, observers, population, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.problem import Observation
 from mmrjax.model import channels, paper_robots
-from mmrjax.model.signals import FAILED, FLAGS, SLIDES, TIPS
+from mmrjax.model.signals import TIPS
 from sweeps.store import RunFolder
 from tests.commands import refused
 
@@ -183,21 +182,6 @@ def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found
     assert off.tolist() == [True, False, False, False]
 
 
-@pytest.mark.slow
-def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found):
-    at = int(found.order[0])
-    calm = population.PopulationSearch(found, at, (), None, np.nan)
-    assert calm.remarks()[0] == Remark(
-        "generations", members=len(found.z), generations=len(found.generations), settled=found.settled
-    )
-    torn = population.PopulationSearch(
-        dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4
-    )
-    assert not torn.remarks()[0].settled and torn.apart == ("a",)
-    assert json_value(calm.to_json())["regression_rms_sd"] is None
-    assert json_value(torn.to_json())["derivatives_apart"] == ["a"]
-
-
 def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
     coordinates = dataclasses.replace(
         posed.coordinates, high=np.where(np.arange(4) == 3, np.log(0.07), posed.coordinates.high)
@@ -210,25 +194,6 @@ def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
         Remark("edge", bound="", sds=-3.0),
         Remark("edge", bound="upper", sds=9.0),
     ]
-
-
-@pytest.mark.slow
-def test_what_members_did_is_counted_and_said(found):
-    at = int(found.order[0])
-    status, flags = np.zeros_like(found.seen.status), np.zeros_like(found.seen.flags)
-    status[:3, 0], status[3, 1], status[4:6, 0] = TIPS, FAILED, SLIDES
-    flags[[at, 7], 1] = 1 << FLAGS.index("jumps")
-    told = population.PopulationSearch(
-        dataclasses.replace(found, seen=dataclasses.replace(found.seen, status=status, flags=flags)),
-        at,
-        (),
-        None,
-        np.nan,
-        {"a": Remark("edge", bound="upper", sds=9.0)},
-    )
-    assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
-    assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
-    assert told.remarks()[1:] == [Remark("ended_at_edge", edge={"a": Remark("edge", bound="upper", sds=9.0)})]
 
 
 @pytest.mark.slow

@@ -201,6 +201,9 @@ def test_a_constant_that_differs_in_one_run_explains_more_than_an_effect_that_im
     effects = fit.roots(np.asarray(linear.signatures)).max()
     if "rough" in fault:
         assert (run, changed) == (3, "motor.friction_coulomb") and root > 1.2 * effects
+        inside = np.repeat(np.isin(np.arange(linear.rows), linear.runs()[2]), linear.readings // linear.rows)
+        slopes = np.asarray(linear.jacobian)[: linear.readings, space.coordinates.base.names.index(changed)]
+        assert root == pytest.approx(fit.roots((slopes * inside)[:, None])[0], rel=1e-9)
     else:
         assert root < 0.8 * effects
 

@@ -15,12 +15,10 @@ from pages import Tables, drawn, outside
 
 from calibration.data import runs as records
 from calibration.data.robot_file import RobotFile
-from mmrjax import fidelities
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params
-from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import compare
@@ -182,36 +180,6 @@ def test_power_chain_sums_to_what_supply_and_slope_give():
     fall = runs["total_mass_kg"] * GRAVITY * np.sin(np.radians(-runs["slope_deg"])) * runs["speed_mm_s"] / 1e3
     assert_allclose(slope[downhill], fall[downhill], rtol=1e-9)
     assert (parts["back to the supply"] > 0).any() and (slope[~downhill] == 0).all()
-
-
-@pytest.fixture(scope="module")
-def driven(robot, tmp_path_factory):
-    """Folder, page and batch of three runs from standstill: one climbs, one slides, one cannot move."""
-    asked = Conditions(["6T2A", "6T2A", "4W2T"], [33.0, 33.0, 0.3], [5.0, 25.0, 5.0]).resolved(robot)
-    batch = jax.device_get(fidelities.get_fidelity("drive").histories(robot, asked, {"duration": 2.0}))
-    runs = records.Runs("the test", {
-        "configuration": np.array(["6T2A", "6T2A", "4W2T"]), "supply_voltage_V": np.asarray(asked.voltage),
-        "payload_kg": np.zeros(3), "slope_deg": np.asarray(asked.slope_deg),
-    })  # fmt: skip
-    table = {**run.condition_table(robot, runs), **run.ending_columns(robot, batch)}
-    folder = tmp_path_factory.mktemp("driven")
-    page_renderer.write_report_page(
-        folder, runs_report.runs_document(RobotFile(robot, "nominal"), "drive", table, batch)
-    )
-    return folder, (folder / "report.html").read_text(), batch
-
-
-@pytest.mark.slow
-def test_report_shows_the_runs_own_history_with_its_peak(driven):
-    folder, page, batch = driven
-    assert drawn(page) == {"history", "power", "drive_chart"} and outside(folder) == []
-    rows = Tables(page).tables["starts"][2:]
-    assert [row[0] for row in rows] == ["6T2A, 33 V, 0 kg, 5°", "6T2A, 33 V, 0 kg, 25°", "4W2T, 0.3 V, 0 kg, 5°"]
-    assert [row[1] for row in rows] == ["settled", "slides", "stands"]
-    for k, row in enumerate(rows):
-        assert float(row[5]) == pytest.approx(batch.history.signals.total_current[k].max(), abs=0.06)
-        assert (row[2] == "–") == (k > 0)  # no stages where it does not get under way
-    assert float(rows[0][5]) > 90  # the inrush is resolved, some 33 V over two windings in parallel
 
 
 def test_comparison_shows_its_rows_and_escapes_its_title(tmp_path):

@@ -13,7 +13,6 @@ from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.signals import CONVERGED, FAILED
 from mmrjax.undercarriage.modes import largest_step
 from sweeps.pages import resonance_figures
 from sweeps.paper import report
@@ -51,28 +50,6 @@ def period(written):
     return 0.035 / (run.signals.speed_wheel[0, run.time[0] > SECONDS - 0.3].mean() * 0.84 / (7 * np.pi))
 
 
-@pytest.mark.slow
-def test_ripple_table_has_the_period_of_equation_34(written, period):
-    cells = re.search(r'id="ripple-table">.*?<tr><td class="words">6T2A</td>(.*?)</tr>', written[1], re.S).group(1)
-    found, expected, current, speed, reaction, guide = map(float, re.findall(r"<td>([^<]+)</td>", cells))
-    assert expected == pytest.approx(1e3 * period, abs=0.006)  # as printed
-    assert found == pytest.approx(1e3 * period, rel=0.02)
-    assert 2 < current < 20 and 0 < speed < 2 and 5 < reaction < 50
-    assert guide == pytest.approx(100 * written[2].steady.guide_share[0], abs=0.06)
-
-
-@pytest.mark.slow
-def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, written):
-    from mmrjax.fidelities.steady import steady
-
-    said = re.search(r'id="guide-share">(.*?)</p>', written[1], re.S).group(1)
-    figures = re.search(r"draws ([\d.]+) A here and ([\d.]+) A by the steady model", said).groups()
-    here, there = map(float, figures)
-    assert here == pytest.approx(written[2].result.total_current[0], abs=0.006)
-    assert there == pytest.approx(float(steady(robot, Conditions(voltage=33.0)).total_current), abs=0.006)
-    assert here > 1.2 * float(there) and "0.3 for this robot" in said
-
-
 @pytest.fixture(scope="module")
 def gears(robot, written):
     run = written[2]
@@ -91,20 +68,6 @@ def test_figure_26_marks_a_touchdown_each_pitch(gears, written, period):
     loads = [np.asarray(line.get_ydata()) for line in lower.lines if line.get_linestyle() == "-"]
     total = np.nansum(loads, axis=0)
     assert_allclose(total, written[2].reactions.grouser[0, -len(total) :].sum(-1))
-
-
-@pytest.mark.slow
-def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written, tmp_path, monkeypatch):
-    run = written[2]
-    broken = dataclasses.replace(
-        run,
-        signals=dataclasses.replace(run.signals, total_current=np.full_like(run.signals.total_current, np.nan)),
-        result=dataclasses.replace(run.result, status=np.array([FAILED, CONVERGED])),
-    )
-    monkeypatch.setattr(report, "simulate_gear_runs", lambda robot: broken)
-    text = page(tmp_path, robot)
-    assert drawn(text) == set()
-    assert re.search(r'id="gear-left-out">.*6T2A: failed, 4W2T: settled', text)
 
 
 @pytest.mark.slow

@@ -72,13 +72,6 @@ def test_robot_of_another_kind_is_shown_and_not_set_against_the_bench(reproduced
 
 
 @pytest.mark.slow
-def test_row_table_has_the_measured_rows(paper):
-    rows = paper[2].tables["rowtable"][2:]
-    assert len(rows) == 20 and len([r for r in rows if r[0] == "4W2T"]) == 10
-    assert sum("–" in r for r in rows) == 6
-
-
-@pytest.mark.slow
 def test_raised_adhesion_makes_every_measured_row_climb(robot):
     rows = data.simulate_measured_rows(robot)
     assert (rows.plain["status"] == "slides").sum() == 6

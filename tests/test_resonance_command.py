@@ -1,21 +1,16 @@
 """The command `resonance`: what it finds on 6T2A, what it leaves, and what it refuses."""
 
-import dataclasses
-import json
 from contextlib import contextmanager
 from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
-from mmrjax.fidelities.track import track_batch
 from mmrjax.model.signals import CONVERGED
 from mmrjax.undercarriage.modes import Mode
 from sweeps import config
 from sweeps.commands import resonance as room
-from sweeps.pages.resonance_figures import draw_resonance_map
 from sweeps.points import run
 from tests.commands import command, read_json, rows, schema_of
 from tests.pages import Tables, drawn, outside
@@ -136,43 +131,6 @@ def test_command_leaves_result_tables_and_a_page_of_its_own(tracked):
     assert len(tables["frequencies"]) == 1 + 6
     assert {"config.resolved.toml", "robot.toml", "manifest.json"} <= {p.name for p in folder.iterdir()}
     assert not folder.with_name("map.partial").exists()
-
-
-@pytest.mark.parametrize("tracked", KINDS[1:], indirect=True)
-def test_ripple_of_reaction_is_that_of_the_track_model(robot, tracked):
-    """Of every point, from the runs themselves, their drift left in."""
-    found = tracked[1]
-    again = config.resolve_configuration(config.Resonance, tracked[0] / "config.resolved.toml", {})
-    conditions = run.conditions_of_runs(
-        robot, room.grid_conditions(room._speed_grid(again, again.voltages_V), robot), again
-    )
-    runs = track_batch(robot, conditions, duration=1.0, step=1e-4, rolling=True, progress=lambda share: None)
-    normal = np.asarray(runs.signals.normal)[:, 500:]
-    ripple = 100 * normal.std(axis=1) / normal.mean(axis=1)
-    assert_allclose(found.table["reaction_ripple_percent"], ripple, rtol=0.02)
-
-
-def test_runs_without_ripple_are_shown_as_what_they_are(tracked):
-    """Half the runs of a payload fail, one slides: still a figure, gaps for numbers, and a sentence that says so."""
-    found = tracked[1]
-    table = {key: values.copy() for key, values in found.table.items()}
-    bad = np.flatnonzero((table["payload_kg"] == 8.0) & (table["supply_voltage_V"] > 30))
-    table["status"][bad] = "failed"
-    table["status"][bad[0]] = "slides"
-    for key in table:
-        if key.endswith(("_percent", "_Hz", "mm_s")):
-            table[key][bad] = np.nan
-    partly = dataclasses.replace(found, table=table)
-    assert "Not every run settles at" in partly.statement()
-    assert partly.statuses["failed"] == len(bad) - 1 and partly.statuses["slides"] == 1
-    assert "failed" in draw_resonance_map(partly).axes[1].get_title()
-    json.dumps(partly.to_json())
-    table["status"][:] = "failed"
-    for key in table:
-        if key.endswith(("_percent", "_Hz", "mm_s")):
-            table[key][:] = np.nan
-    none = dataclasses.replace(found, table=table, peaks=[], crossings=[])
-    assert none.statement() == "No run of 6T2A travels (see status)."
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -178,11 +178,6 @@ def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(ran, tmp_path
     assert [row["payload_kg"] for row in rows_of(folder / "runs.csv")] == ["0"] * 4
 
 
-@pytest.mark.slow
-def test_a_sweep_into_a_store_knows_what_is_imposed(ran, tmp_path):
-    ran("sweep --motor-speeds 600,1200 --zarr --export csv --robot", of_kind(tmp_path, "bench", speed=True))
-
-
 # --- measured tables ----------------------------------------------------------------------------------------------
 
 
@@ -207,98 +202,7 @@ def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, benc
     assert words_of_others(out, said, err) == []
 
 
-@pytest.mark.nightly
-def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
-    rig, data = bench
-    _, told, err = ends(
-        mmrjax("loop", data, "--robot", rig, "--replicates", "250", "--out", "found"),
-        "total current",
-        code=0,
-    )
-    defects = (tmp_path / "found/figures/defects.svg").read_text()
-    assert "torque missing at the output" in defects and "voltage missing" not in defects and "slip" not in defects
-    page = (tmp_path / "found/report.html").read_text()
-    assert "The channels determine the errors of 1 equation: torque." in page
-    assert words_of_others(*left_in(tmp_path / "found"), told, err) == []
-
-
-MOTOR = """
-schema = "mmrjax.robot/2"
-base = "none"
-sides = 1
-imposed = "voltage"
-channels = ["motor_current", "motor_speed"]
-[motor]
-resistance = "2.3 ± 5 %"
-torque_constant = "0.021 ± 3 %"
-friction_coulomb = "0.002 ± 20 %"
-friction_viscous = "1e-6 ± 50 %"
-inertia = 6e-6
-[gearbox]
-ratio = 1.0
-efficiency_load = "1 ± 0"
-[bench]
-load = "shaft"
-inertia = 1e-8
-loss_coulomb = "0 ± 0"
-loss_viscous = "0 ± 0"
-[columns]
-supply_voltage_V = "U [V]"
-motor_current_A = {column = "Strom [mA]", factor = 1e-3}
-motor_speed_rpm = "Drehzahl [1/min]"
-"""
-
-
-def precise_table(path):
-    """Settled runs of a motor with a brake of air, 6 nN·m·s², read to a thousandth, as a logger far from here writes
-    them. From the laws in NumPy."""
-    volts = np.array([5, 6.5, 8, 9.5, 11, 12.5, 14, 15.5, 17, 18.5, 20, 22, 24, -7, -11, -15, -19, -23])
-    r, k, dry, viscous, air = 2.3, 0.021, 0.0022, 1.1e-6, 6e-9
-    # k (u - k w) / r = dry + viscous w + air w², of magnitudes
-    size = np.abs(volts)
-    b, c = viscous + k * k / r, dry - k * size / r
-    speed = np.sign(volts) * (-b + np.sqrt(b * b - 4 * air * c)) / (2 * air)
-    random = np.random.default_rng(5)
-    current = 1e3 * ((volts - k * speed) / r + 5e-4 * random.normal(size=len(volts)))
-    rpm = speed * 30 / np.pi + 0.6 * random.normal(size=len(volts))
-    lines = ["U [V];Strom [mA];Drehzahl [1/min];motor_current_sd_mA;motor_speed_sd_rpm"]
-    lines += [f"{u:g};{i:.3f};{n:.2f};0.5;0.6".replace(".", ",") for u, i, n in zip(volts, current, rpm, strict=True)]
-    path.write_text("\n".join(lines) + "\n", encoding="cp1252")
-    return path
-
-
-@pytest.mark.nightly
-def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
-    """170 σ of it: without the effect the fit is so far off that by its slopes another effect would explain more."""
-    (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
-    data = precise_table(tmp_path / "runs.csv")
-    _, told, _ = ends(mmrjax("loop", data, "--robot", "motor.toml", "--replicates", "250", "--out", "found"), code=0)
-    found = read_json(tmp_path / "found/result.json")
-    assert found["verdict"] in ("named", "class"), told
-    (effect,) = found["effects"]
-    amplitude = effect["parameters"]["amplitude"]
-    assert effect["standing"] == "established" and effect["name"] in ("churning", "windage")
-    assert abs(amplitude["value"] - 6e-9) < 3 * amplitude["sd"] < 1e-9
-
-
-@pytest.mark.slow
-def test_compare_shows_a_vehicles_conditions(ran, rover):
-    rig, data = rover
-    shown = (ran("compare", data, "--robot", rig)[1] / "figures/errors.svg").read_text()
-    assert "motor speed [rpm]" in shown and "slope" in shown and "supply voltage" not in shown
-
-
 # --- sensitivity --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["bench", "wheeled"])
-def test_sensitivity_takes_what_a_rig_has(ran, tmp_path, kind):
-    rig = of_kind(tmp_path, kind, speed=kind == "bench")
-    where = "--motor-speeds 1000,3000" if kind == "bench" else "--voltages 12,24 --slopes 0,5"
-    out, _ = ran(f"sensitivity --method local {where} --robot", rig)
-    assert "operating points" in out
-    assert ("steepest slope" in out) == (kind == "wheeled")
 
 
 # --- the pieces ---------------------------------------------------------------------------------------------------
@@ -326,16 +230,6 @@ def test_parameters_of_a_rig_are_those_that_its_file_states(tmp_path):
     )
     assert "motor.resistance" in wheeled and "battery.voltage_full" not in wheeled
     assert "carriage.inertia" in linear and "bench.radius" not in bench
-
-
-def test_the_packaged_robots_parameters_keep_their_sources(tmp_path, robot):
-    specs = {p.name: p.spec for p in params.walk_parameters(robot)}
-    assert "eq. (15)" in specs["motor.resistance"].meaning
-    own_specs = {p.name: p.spec for p in params.walk_parameters(robot_file.read_robot(of_kind(tmp_path, "bench")))}
-    assert "eq." not in own_specs["motor.resistance"].meaning
-    assert (
-        own_specs["motor.resistance"].source == params.STATED and own_specs["motor.inertia"].source == params.DEFAULT
-    )
 
 
 def test_forbidden_words_are_seen():

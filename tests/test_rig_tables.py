@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import configuration_tables, inferred_facts, robot_file
+from calibration.data import configuration_tables, inferred_facts
 from calibration.data import runs as records
 from calibration.inference import bases, blocks, checks, noise, observers, priors
-from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
 from calibration.inference.ranges import check_ranges
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import paper_robots, params, quantities
+from mmrjax.model import paper_robots, params
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import Friction, Ground, Track
@@ -84,26 +83,6 @@ def test_a_vehicle_takes_its_mass_from_its_file_and_the_flat_without_payload(tmp
     conditions = runs.conditions(robot)
     assert conditions.total_mass is None and conditions.slope_deg == 0 == conditions.payload
     assert runs.axes == ("supply_voltage_V", "payload_kg", "slope_deg")
-
-
-def test_a_packaged_robot_reads_its_tables_as_ever(robot):
-    with_robot, without = records.read_runs("measured", robot=robot), records.read_runs("measured")
-    assert list(with_robot.columns) == list(without.columns) and with_robot.unknown == without.unknown
-    assert all((with_robot[c] == without[c]).all() for c in without.columns)
-
-
-UNITS = {
-    "motor_speed_rad_s,total_current_mA": ("104.71975511965977,400", (1000.0, 0.4)),
-    "motor_speed_turns_s,total_current_A": ("50,0.4", (3000.0, 0.4)),
-}
-
-
-@pytest.mark.parametrize("header", UNITS)
-def test_units_are_read_where_the_name_says_so(tmp_path, header):
-    row, (speed, current) = UNITS[header]
-    runs = read(tmp_path, f"{header}\n{row}\n", bench())
-    assert runs["motor_speed_rpm"] == pytest.approx([speed], rel=1e-14)
-    assert runs["total_current_A"] == pytest.approx([current], rel=1e-14)
 
 
 def test_conditions_and_sds_are_read_in_other_units(tmp_path):
@@ -451,53 +430,6 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
         records.read_runs(path, robot=bench())
     signed = re.sub(r"(-\d+),0", r"\1,-0", path.read_text(encoding="utf-8"))
     assert records.read_runs(text_file(path, signed), robot=free).layout.instruments[0].signed is True
-
-
-@pytest.mark.slow
-def test_a_calibration_of_a_free_instrument_leaves_what_it_found(tmp_path):
-    text = """
-base = "none"
-imposed = "motor_speed"
-channels = ["total_current"]
-[motor]
-torque_constant = "0.05 ± 3 %"
-friction_coulomb = "0.004 ± 20 %"
-[gearbox]
-ratio = 16
-efficiency_load = 0.8
-[brake]
-load = "shaft"
-inertia = 0.001
-loss_coulomb = "0.1 ± 50 %"
-loss_viscous = "0.002 ± 50 %"
-[instruments.total_current]
-signed = "free"
-quantum = "free"
-"""
-    robot = read_rig(tmp_path, text)
-    assert robot.rig.instruments == (Instrument("total_current", None, None),)
-    robot_file.write_robot(robot, tmp_path / "again.toml", note="of a test")
-    assert robot_file.read_robot(tmp_path / "again.toml").rig.instruments == robot.rig.instruments
-    speeds = np.array([-4000, -3100, -2700, -1900, -1300, -1000, 1000, 1600, 2300, 2900, 3700, 4000.0])
-    robot_there = params.replace(robot, {"brake.loss_coulomb": 0.15})
-    truth = steady_batch(robot_there, Conditions(motor_speed=speeds * quantities.RPM)).reading["total_current"]
-    assert truth[0] < 0  # without a table it is shown with its sign
-    read = np.round(np.abs(truth) / 0.004) * 0.004
-    path = tmp_path / "t.csv"
-    rows = "".join(f"{n:g},{i:.3f},0.002\n" for n, i in zip(speeds, read, strict=True))
-    found = calibrate(
-        records.read_runs(
-            text_file(path, "motor_speed_rpm,total_current_A,total_current_sd_A\n" + rows), robot=robot
-        ),
-        robot,
-        starts=2,
-        profiles=False,
-        blocks=False,
-    )
-    (instrument,) = found.robot.rig.instruments
-    assert instrument.signed is False and instrument.quantum == pytest.approx(0.004, rel=1e-6)
-    loss = found.parameters["brake.loss_coulomb"]
-    assert abs(loss.value - 0.15) < 3 * loss.sd
 
 
 # --- doubts that follow the robot's file ----------------------------------------------------------------------------

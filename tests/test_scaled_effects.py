@@ -119,17 +119,6 @@ def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, k
     assert off_library  # else there would be nothing to state
 
 
-@pytest.mark.slow
-def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp_path):
-    """The loop writes them into the robot of a table of turns, which every command takes."""
-    robot, *_ = rig("wheeled", "voltage", tmp_path)
-    beside = effects.OF_TURNS | effects.OF_CHANNELS
-    library = {name: scaled_effect(kind, (3.0, 1.0, 2.0)) for name, kind in beside.items()}
-    whole = with_all(robot, library, 0.5)
-    robot_file.write_robot(whole, tmp_path / "robot.toml")
-    assert library and eqx.tree_equal(whole.effects, robot_file.read_robot(tmp_path / "robot.toml").effects)
-
-
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("kind, imposed", RIGS)
 def test_an_instrument_is_off_by_no_more_than_a_share_of_what_it_shows(tmp_path, kind, imposed):
@@ -259,24 +248,3 @@ def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
     (torque,) = (e for e in scored if e.name == "output_torque_offset")
     size = np.sqrt(np.mean(runs["output_torque_Nm"] ** 2))
     assert amplitude_of(torque()).spec.bounds == pytest.approx(np.array([-1, 1]) * scales.MOST_OFF * size, rel=0.01)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("signed", [True, False])
-def test_a_current_sensors_offset_is_named(tmp_path, signed):
-    """Of a bench driven both ways. Where the sensor shows magnitudes a friction may look alike."""
-    shown = f"[instruments.motor_current]\nsigned = {str(signed).lower()}\n"
-    robot = read_rig(tmp_path, METERED.replace(', "output_torque"', ', "motor_current"') + shown)
-    off = effects.OF_CHANNELS["motor_current_offset"](amplitude=0.02)
-    volts = np.linspace(4.0, 24.0, 8)[:, None] * [1.0, -1.0]
-    seen = mm.simulate(dataclasses.replace(robot, effects=(off,)), mm.Conditions(voltage=volts.ravel()))
-    read = np.stack([seen.total_current, np.asarray(seen.motor_speed) / RPM, seen.motor_current])
-    sd = 0.003 * np.abs(read).mean(1, keepdims=True)
-    read += sd * np.random.default_rng(1).standard_normal(read.shape)
-    heads = "supply_voltage_V,total_current_A,motor_speed_rpm,motor_current_A,"
-    heads += "total_current_sd_A,motor_speed_sd_rpm,motor_current_sd_A"
-    rows = np.column_stack([volts.ravel(), read.T, np.broadcast_to(sd.T, read.T.shape)])
-    np.savetxt(tmp_path / "runs.csv", rows, "%.6g", ",", header=heads, comments="")
-    found = mm.discover(records.read_runs(tmp_path / "runs.csv", robot=robot), robot)
-    assert found.verdict in ("named", "class") and [e.name for e in found.effects] == [off.name]
-    assert found.effects[0].parameters["amplitude"].value == pytest.approx(0.02, abs=0.005)

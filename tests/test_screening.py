@@ -93,43 +93,6 @@ RANKING = EffectRanking(
 )  # fmt: skip
 
 
-def test_what_is_ranked_is_said_not_to_be_confirmed():
-    first, *lines = words.ranking_lines(RANKING)
-    assert "by regression, not yet confirmed: something is missing" in first
-    assert lines == [
-        "  1. churning, a loss torque that changes with speed: lowers the misfit by 412 σ², "
-        "amplitude 0.0123 ± 0.0004 N·m"
-    ]  # the others explain no more than chance, or would supply power
-    nothing = dataclasses.replace(RANKING, missing=False, p_value=0.4)
-    assert words.ranking_lines(nothing) == [
-        "by regression, not yet confirmed: no effect of the library exceeds chance (family-wise p = 0.4)"
-    ]
-
-
-def test_a_ranking_answers_with_a_mechanism_at_most_and_with_parameters():
-    found = dataclasses.replace(RANKING, parameters={"motor.inertia": (2.5e-4, 1e-6)})
-    assert words.regression_verdict(found) == (
-        "regression only, not confirmed: perhaps a loss torque that changes with speed is "
-        "missing (churning). Parameters [SI]: motor.inertia 0.00025 ± 1e-06"
-    )
-    assert words.regression_verdict(dataclasses.replace(found, effects=(), parameters={})).endswith(
-        "no effect explains it"
-    )
-    nothing = dataclasses.replace(RANKING, missing=False)
-    assert words.regression_verdict(nothing).endswith("not confirmed: no effect of the library exceeds chance")
-
-
-def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
-    found = SimpleNamespace(best=SimpleNamespace(effects=("churning",)))
-    library = {"churning": BY_NAME["churning"]()}
-    base = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(library=library)))
-    folder = SimpleNamespace(keeps=lambda name: True, path="found")
-    command._report_stored_stages({"ranking": RANKING, "search 0": (base, None, found)}, folder, "rig.toml")
-    said = capsys.readouterr().err
-    assert "so far, simulation confirms a loss torque that changes with speed (churning)." in said
-    assert said.index("by regression") < said.index("so far")
-
-
 @pytest.mark.parametrize("missing", [True, False])
 def test_a_simulation_that_contradicts_the_regression_is_said_to(missing, capsys):
     folder = SimpleNamespace(keeps=lambda name: True, path="found")

@@ -21,7 +21,7 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps.report import sensitivity_report
 from sweeps.report.document import Figure
-from tests.commands import ends, read_json, schema_of
+from tests.commands import read_json, schema_of
 from tests.commands import rows as table
 from tests.pages import outside
 
@@ -62,16 +62,6 @@ def test_local_derivatives_are_finite_differences_and_zero_across_configurations
     assert np.isnan(found["total_current"].derivative[3]).all()  # it slides at 25°
     assert found["speed"].derivative[1, 1] == 0 and found["speed"].derivative[0, 2] == 0
     assert statuses == {"steady": {"converged": 3, "slides": 1}}
-
-
-@pytest.mark.slow
-def test_swings_are_runs_at_the_ends_of_the_intervals(study, robot):
-    found, _ = local_studies(study)
-    coordinates = priors.parameter_coordinates(robot, NAMES)
-    for side, z in enumerate((-1.959963984540054, 1.959963984540054)):
-        value = coordinates.value(jnp.zeros(4).at[1].set(z))[1]
-        run = steady_batch(params.replace(robot, {NAMES[1]: value}), study.conditions)
-        assert_allclose(found["speed"].swing[side, :3, 1], run.speed[:3], rtol=1e-9)
 
 
 def test_inputs_are_those_of_the_priors(robot, study):
@@ -162,34 +152,6 @@ def test_an_output_that_nothing_changes_has_no_figures(monkeypatch):
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("vary", ["voltage=22:26", "total_mass=12:16"])
-def test_conditions_that_vary_are_inputs(mmrjax, tmp_path, vary):
-    ends(
-        mmrjax(
-            "sensitivity --method local --parameters",
-            NAMES[0],
-            "--payloads",
-            "3",
-            "--slopes",
-            "0",
-            "--configurations",
-            "6T2A",
-            "--outputs",
-            "speed",
-            "--vary",
-            vary,
-            "--no-report",
-            "--out",
-            "v",
-            *(() if "voltage" in vary else ("--voltages", "24")),
-        ),
-        code=0,
-    )
-    document = read_json(tmp_path / "v/result.json")
-    assert vary.partition("=")[0] in document["inputs"]
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 import contextlib
 import re
-import time
 
 import numpy as np
 import pytest
@@ -87,28 +86,6 @@ def test_noise_does_not_cut_levels_short(tmp_path, noise):
     assert len(shares) == 30 and min(shares) > 0.5 and np.mean(shares) > 0.9
 
 
-@pytest.mark.nightly
-def test_sds_hold_over_random_logs(tmp_path):
-    """Holds of 1 to 4 s, lags up to 0.4 s, 50 to 250 Hz, noise, steps, delays and clocks that jitter."""
-    z, levels, kept = [], 0, 0
-    for seed in range(16):
-        rng = np.random.default_rng([77, seed])
-        world = rigs.world(rng, rows=(16, 60))
-        rigs.case(world).write(tmp_path)
-        log = rigs.log(
-            world, rng, hold=rng.uniform(1, 4), rate=rng.choice([50, 100, 250]), lag=rng.uniform(0.02, 0.4),
-            noise=rng.uniform(0.5, 6), jitter=rng.uniform(0, 0.3), delay=rng.choice([0, 0, 0.05]),
-            step=rng.choice([0, 0, 1, 3]),
-        )  # fmt: skip
-        log.write(tmp_path / "log.csv")
-        found = settled(tmp_path, robot_file.read_robot(tmp_path / "rig.toml"))
-        z.append(np.abs(deviations(log, found)).ravel())
-        levels, kept = levels + len(world.conditions), kept + len(found.kept)
-    every = np.concatenate(z)
-    assert 0.8 < np.sqrt(np.mean(every**2)) < 1.25 and np.mean(every > 3) < 0.03 and np.mean(every > 5) < 5e-3
-    assert kept > 0.8 * levels
-
-
 def test_means_hold_where_starts_take_many_times_the_settled_current(tmp_path):
     """A motor's current after a step of voltage: I = I_∞ + (I_0 - I_∞) exp(-t / T), speed alike."""
     R, C, K, dry, lag, z = 1.2, 0.05, 1e-4, 0.02, 0.18, []
@@ -132,14 +109,6 @@ def test_means_hold_where_starts_take_many_times_the_settled_current(tmp_path):
         truth = [(dry + K * speeds[s.rows[0]]) / C for s in found.kept]
         z += [(s.mean["total_current"] - x) / s.sd["total_current"] for s, x in zip(found.kept, truth, strict=True)]
     assert np.sqrt(np.mean(np.square(z))) == pytest.approx(0.9, abs=0.25) and np.abs(z).max() < 3.5
-
-
-def test_a_log_that_is_left_too_early_is_not_settled(tmp_path):
-    """The comparison can fail: with a lag of a quarter of the level hardly anything has settled."""
-    _, world, robot = made(tmp_path, 6, "tracked", "voltage", lag=0.5)
-    found = settled(tmp_path, robot)
-    assert len(found.kept) < 0.2 * len(world.conditions)
-    assert {s.why for s in found.stretches} <= {"", "settling", "accelerates"}
 
 
 def test_the_autocorrelation_of_readings_widens_their_mean():
@@ -279,13 +248,6 @@ def test_what_cannot_be_settled_is_said_with_row_and_remedy(tmp_path, case):
         settled(tmp_path, robot)
 
 
-def examined(tmp_path, monkeypatch):
-    """What `rig check` finds of the bench and its log, without a fit."""
-    nothing = InformationForecast((), (), (), (), (), None)
-    monkeypatch.setattr(rig_check.foresight, "predict_identifiability", lambda runs, robot: nothing)
-    return rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
-
-
 SIGNS = [case for case in WRONG if "sign" in case or "round" in case]
 
 
@@ -293,29 +255,14 @@ SIGNS = [case for case in WRONG if "sign" in case or "round" in case]
 def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, case):
     change, said = WRONG.get(case, (lambda _: both_ways(), ""))
     bench(tmp_path, change(None))
-    found = examined(tmp_path, monkeypatch)
+    nothing = InformationForecast((), (), (), (), (), None)
+    monkeypatch.setattr(rig_check.foresight, "predict_identifiability", lambda runs, robot: nothing)
+    found = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
     if not said:
         assert found.doubts == ()
     else:
         (doubt,) = found.doubts
         assert re.search(said, doubt) and doubt in found.remarks()
-
-
-@pytest.mark.parametrize("duty", [False, True])
-def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, monkeypatch, duty):
-    columns = both_ways() | ({"duty": np.full(800, 0.5)} if duty else {})
-    bench(tmp_path, columns)
-    remarks = examined(tmp_path, monkeypatch).remarks()
-    assert any("Motor leads carry motor_current" in s for s in remarks) == duty
-
-
-@pytest.mark.quick(1)
-@pytest.mark.parametrize("case", CASES)
-def test_signs_and_times_of_random_logs_are_not_doubted(tmp_path, case):
-    seed, kind, imposed, options = CASES[case]
-    _, _, robot = made(tmp_path, seed, kind, imposed, **options)
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
-    assert settling.doubtful_sign(runs) == "" == rig_facts.doubtful_time(runs, robot)
 
 
 def test_time_in_milliseconds_is_doubted_where_a_start_shows_it(tmp_path):
@@ -489,35 +436,11 @@ def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrja
     assert (tmp_path / "found/figures/log.svg").is_file()
 
 
-@pytest.mark.slow
-def test_25_000_rows_are_settled_in_seconds(tmp_path):
-    _, _, robot = made(tmp_path, 9, "bench", "voltage", rate=250.0)
-    text = (tmp_path / "log.csv").read_text().splitlines()
-    rows = min(len(text) - 1, 25_000)
-    (tmp_path / "log.csv").write_text("\n".join(text[: rows + 1]) + "\n")
-    began = time.process_time()
-    assert rows > 15_000 and settled(tmp_path, robot).kept
-    assert time.process_time() - began < 10 * rows / 25_000
-
-
 def test_a_column_without_a_role_may_be_empty_for_a_while(tmp_path):
     columns = stairs() | {"ambient_C": np.where(np.arange(600) < 250, "", "21.5")}
     robot = bench(tmp_path, columns)
     found = settled(tmp_path, robot).table()["ambient_C"]
     assert_array_equal(found, [np.nan, 21.5, 21.5])
-
-
-def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
-    found, loop = settled(tmp_path, bench(tmp_path, stairs())), "mmrjax loop log.csv"
-    said = words.sentence_on_few_settled_runs(found, 6, loop)
-    assert (
-        "run it on the log: mmrjax loop log.csv." in said and words.sentence_on_few_settled_runs(found, 3, loop) == ""
-    )
-    every = [settling.Stretch("", np.arange(9), 0.0, 1.0, 6.0, why) for why in settling.REASONS]
-    told = {row[0]: row[-1] for row in words.omitted_stretches(every, few=True)}
-    reasons = settling.REASONS
-    assert {told[reasons[why][0]] for why in words.OF_LEVELS} == {"nothing, a fit to the log uses them"}
-    assert told[reasons["stuck"][0]] == reasons["stuck"][1]
 
 
 def turning(tmp_path):

@@ -4,15 +4,13 @@ import itertools
 import math
 
 import jax
-import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from calibration.data import requirements_file, robot_file
 from calibration.sizing import design_search, sheet
-from calibration.sizing.design import build_robot, build_sizing_task, evaluate_design
+from calibration.sizing.design import build_robot, build_sizing_task
 from calibration.sizing.part_options import (
     BELT_STAGE,
     MOTOR,
@@ -136,26 +134,6 @@ def test_binding_limits_are_why_it_is_no_lighter(robot, asked, found):
     )  # fmt: skip
     x = np.log([[ideal.ratio, ideal.radius, ideal.parallel * 0.97]])
     assert design_search.evaluate_designs(of, choice, np.array([row]), x)[1].min() < 0
-
-
-@pytest.mark.slow
-def test_margins_are_differentiable(robot, asked, found):
-    of, choice = space(robot, asked, found)
-    f = found.best
-    row = next(k for k in range(len(choice.drive)) if found.options.drives[choice.drive[k]] == f.drive)
-    x = np.log([[f.ratio * 1.01, f.radius * 0.97, f.parallel * 1.1]])
-    design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x))
-
-    @jax.jit
-    def margins(x):
-        objectives, g = evaluate_design(of, type(design)(x, design.drive, design.cell, design.cells))
-        return jnp.concatenate([objectives[:2], g])
-
-    exact = np.asarray(jax.jacrev(margins)(jnp.asarray(x[0])))
-    for k in range(3):
-        step = 1e-5 * np.eye(3)[k]
-        difference = (np.asarray(margins(x[0] + step)) - np.asarray(margins(x[0] - step))) / 2e-5
-        assert_allclose(exact[:, k], difference, rtol=1e-3, atol=1e-5)
 
 
 def test_paper_parts_make_the_papers_robot(robot, asked):

@@ -30,7 +30,6 @@ from calibration.discovery.standing import (
     _largest_variation,
     _most_influential_row,
     _recurrence,
-    changed_run,
     cost_of_names,
     equation_of_place,
     evidence_of_names,
@@ -335,40 +334,6 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
     row, least = _most_influential_row(space, fit, signature)
     falls = [fall(np.repeat(rows != k, 3)) for k in rows]
     assert row == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
-
-
-def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find(toy, monkeypatch):
-    """Against the fall of χ² by a parameter's column, or a constant error of a place, within each run."""
-    rng = np.random.default_rng(5)
-    readings, runs = len(toy.readings), np.split(np.arange(toy.rows), 4)
-    linear = toy.linear
-    monkeypatch.setattr(type(linear), "runs", lambda self: runs)
-    families = [("mass", "speed"), ("slip", "speed")]  # no reading shows the first
-    monkeypatch.setattr("calibration.discovery.standing.bases_room.family_names", lambda _: families)
-    error = rng.standard_normal((readings, 1))
-    monkeypatch.setattr(
-        "calibration.discovery.standing.family_columns", lambda _, __, k: np.c_[error, 2 * error][:, : 2 * k]
-    )
-    jacobian, residual = augment_with_columns(toy.linear, rng.standard_normal((readings, 2)))
-    residual[:readings] += 9.0 * error[:, 0] * np.repeat(np.isin(np.arange(toy.rows), runs[2]), 3)
-    parameters = np.asarray(toy.linear.jacobian)[:readings]
-    names = [f"p{k}" for k in range(parameters.shape[1])]
-    coordinates = SimpleNamespace(base=SimpleNamespace(names=names))
-    space = SimpleNamespace(included=toy.counts, coordinates=coordinates, free=len(names))
-
-    def left(columns):
-        return np.sum((residual + columns @ np.linalg.lstsq(columns, -residual, rcond=None)[0]) ** 2)
-
-    best = (0.0, 0, "")
-    for k, rows in enumerate(runs):
-        inside = np.repeat(np.isin(np.arange(toy.rows), rows), 3)
-        for name, column in zip([*names, "slip"], [*parameters.T, error[:, 0]], strict=True):
-            extra = np.append(column * inside, np.zeros(len(residual) - readings))[:, None]
-            best = max(best, (left(jacobian) - left(np.c_[jacobian, extra]), k + 1, name))
-    run, changed, root = changed_run(space, linear, (), Projection(jacobian, residual))
-    assert (run, changed) == best[1:] == (3, "slip") and root**2 == pytest.approx(best[0], rel=1e-6)
-    runs[:] = [np.arange(toy.rows)]
-    assert changed_run(space, linear, (), Projection(jacobian, residual)) == (None, "", 0.0)
 
 
 @pytest.mark.parametrize(

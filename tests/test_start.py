@@ -1,6 +1,5 @@
 """Runs from standstill as they are written: by the clock of the rig, with the slip over the stages of the start."""
 
-import jax
 import jax.numpy as jnp
 import jsonschema
 import numpy as np
@@ -106,40 +105,6 @@ def test_stages_are_seen_through_the_ripple_of_a_running_gear():
 
 
 # --- the rig's delay --------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("delay", [0.05, -0.02])
-def test_a_history_is_written_by_the_rigs_clock(written, delay):
-    """What is imposed acts that much later than its column says, and all that is read with it."""
-    prompt, _ = written()
-    late, result = written(f"[rig]\ndelay = {delay}\n")
-    assert late["time_s"][0] == 0 and (late["time_s"] >= 0).all()
-    for name in set(late) - {"time_s", "voltage_V", "run_id"}:
-        expected = np.interp(late["time_s"] - delay, prompt["time_s"], prompt[name])
-        assert_allclose(late[name], expected, rtol=1e-6, atol=1e-6 * np.abs(prompt[name]).max())
-    if delay > 0:  # the peak of the inrush is kept
-        assert late["total_current_A"].max() == pytest.approx(prompt["total_current_A"].max(), rel=1e-6)
-    assert np.abs(late["speed_mm_s"] - np.interp(late["time_s"], prompt["time_s"], prompt["speed_mm_s"])).max() > 10
-    (start,) = result["starts"]
-    assert start["acceleration_time_s"] == pytest.approx(0.5 + delay, abs=0.01)
-
-
-def test_the_delay_of_histories_is_the_one_of_fits():
-    """What is between instants is the straight line between instants, held beyond them, also where a run ends in no numbers."""
-    t, delay = np.array([0.0, 0.01, 0.03, 0.08]), 0.004
-    x = np.stack([np.sin(40 * t), t**2], 1)
-
-    def late(delay, values, at):
-        return Rig.between(jnp.asarray(values), *Rig(delay=delay).before(jnp.asarray(t), at))
-
-    at = np.array([0.0, 0.003, 0.004, 0.014, 0.02, 0.07, 0.2])
-    ended = np.where(t > 0.02, np.nan, t)
-    got, last = jax.jit(lambda: (late(delay, x, at), late(delay, ended, 0.01 + delay)))()
-    assert_allclose(got, np.stack([np.interp(at - delay, t, c) for c in x.T], 1), rtol=1e-12, atol=1e-15)
-    assert last == pytest.approx(0.01)
-    slope = jax.jit(jax.grad(lambda d: late(d, x[:, 1], 0.05)))(delay)
-    assert slope == pytest.approx(-(0.08**2 - 0.03**2) / 0.05)
 
 
 def test_a_delay_that_is_none_changes_no_number(robot):

@@ -5,7 +5,6 @@ import time
 import numpy as np
 import pytest
 import zarr
-from pages import Tables, drawn
 
 from mmrjax.climbing.climb_simulation import NAMES, OVER, SLIDES, TIPS
 from mmrjax.fidelities.variation import STATUS, Variation
@@ -116,33 +115,6 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     assert climbed == [[0.0, 0.0], [30.0, 30.0], [60.0, 60.0]]
     store = zarr.open_group(tmp_path / "map/results.zarr", mode="r")
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
-
-
-@pytest.mark.slow
-def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_path, monkeypatch):
-    """Climbs in closed form: the steeper the levers the higher, up to the last, which falls."""
-
-    def closed(of, variation, conditions, values, sizes, told):
-        most = np.array([70, 250, 40])[(np.asarray(values)[:, 0] / 30).astype(int)]
-        own = {tasks.LARGEST: most * 1.0} if of.find else {tasks.VERDICT: np.where(sizes <= most, OVER, TIPS)}
-        found = {name: np.full(len(most), 1.0) for name in tasks.climb_attributes(of)} | own
-        found[tasks.VERDICT] = found[tasks.VERDICT].astype(np.uint8)
-        return {**found, STATUS: np.zeros(len(most), np.uint8)}
-
-    monkeypatch.setattr(tasks, "compute_climbs", closed)
-    text = MAP.replace("report = false", "")
-    (tmp_path / "map.toml").write_text(text)
-    (tmp_path / "find.toml").write_text(
-        text.replace("obstacle_mm = [60, 500]", "adhesion = [0.5]").replace('"step"', '"step"\nfind = true')
-    )
-    for name, size in {"map": 60, "find": 250}.items():
-        assert mmrjax("sweep", f"{name}.toml", "--out", name)[0] == 0
-        page = (tmp_path / name / "report.html").read_text("utf-8")
-        where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg, adhesion 0.5"
-        assert f"The largest obstacle that the robot gets over: {size} mm, at {where}." in page
-    page = (tmp_path / "map/report.html").read_text("utf-8")
-    names = {name: (meaning, unit) for name, meaning, unit, _ in Tables(page).tables["names"][1:]}
-    assert names["obstacle_mm"] == ("height of the step", "mm") and "endings" in drawn(page)
 
 
 @pytest.mark.slow

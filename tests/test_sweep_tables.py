@@ -15,7 +15,6 @@ from mmrjax.model import params
 from sweeps import config
 from sweeps.points import run, scale
 from sweeps.points.sampled_design import DrawnSamples
-from sweeps.store import RunFolder
 from tests.test_sweep_posterior import NAMES, correlated_posterior
 
 DRAWS = 12
@@ -88,32 +87,6 @@ def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
     whole = run.simulate_draws(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)
     parted = run.simulate_draws(robot, posterior, runs, chunked(4), DRAWS)
     same(whole, parted, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkeypatch):
-    whole = run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS)
-    folder, computed, honest = RunFolder(tmp_path / "r", {}), [], scale.Compiled.__call__
-
-    def interrupted(compiled, values, *told):
-        if len(computed) == 2:
-            raise KeyboardInterrupt
-        computed.append(compiled)
-        return honest(compiled, values, *told)
-
-    monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
-    kept = len(list((tmp_path / "r.partial/chunks").glob("draws-*.stage")))
-    assert kept <= 2
-    computed.clear()
-    monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
-    same(run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder), whole)
-    assert len(computed) == 4 - kept
-    again = run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
-    assert len(computed) == 4 - kept  # nothing is left to do
-    same(again, whole)
-    folder.close()
 
 
 @pytest.mark.slow

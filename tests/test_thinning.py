@@ -2,11 +2,9 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from worlds import rigs
 
 from calibration.data import columns, input_files
 from calibration.data.input_errors import BadConfiguration
@@ -15,13 +13,10 @@ from calibration.data.unused_readings import FIRST, thin_rows
 from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import calibration as calibrate
-from calibration.inference import foresight
 from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import infer_noise
 from calibration.inference.observers import Histories, SettledRuns
 from mmrjax.model import paper_robots
-from sweeps.commands import rig_check
-from sweeps.report.terminal_renderer import print_document
 from tests.commands import refused, with_columns
 
 EVERY, ROWS = 0.01, 300
@@ -156,18 +151,6 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
     assert np.abs(times - at).min() < 1e-9
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("drive", DRIVES)
-def test_a_run_shows_what_it_shows_in_the_whole_log(drive):
-    """Its readings are those of the whole log at the same rows, to what its longer steps make."""
-    whole, robot = log(1, voltage=DRIVES[drive]), paper_robots.nominal()
-    some = thin_rows(whole, 40)
-    shown = [np.asarray(jax.jit(lambda o: o(robot).reading)(Histories.of(x, robot))) for x in (whole, some)]
-    at = [int(np.flatnonzero(whole["time_s"] == t)[0]) for t in some["time_s"]]
-    off = np.abs(shown[1] - shown[0][at]) / np.abs(shown[0]).max(0)
-    assert off.max() < 2e-3
-
-
 def test_that_a_log_is_thinned_is_said():
     runs = log()
     some = thin_rows(runs, 100)
@@ -176,26 +159,6 @@ def test_that_a_log_is_thinned_is_said():
     ]
     assert said == [Remark("thinned", source="log.csv", rows=len(runs), kept=len(some))]
     assert f"{len(some)} of {len(runs)} rows" in describe(said[0])
-
-
-def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
-    rng = np.random.default_rng([27, 1])
-    world = rigs.world(rng, "bench", "voltage", rows=(16, 60))
-    rigs.case(world).write(tmp_path)
-    rigs.log(world, rng).write(tmp_path / "log.csv")
-
-    def foresee(runs, robot):
-        runs = thin_rows(runs)
-        return foresight.InformationForecast(
-            (), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), (), robot
-        )
-
-    monkeypatch.setattr(rig_check.foresight, "predict_identifiability", foresee)
-    found = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
-    used = len(found.foresight.status)
-    assert 0.9 * 4000 < used < 4200 < len(found.runs)
-    print_document(rig_check.check_document(found))
-    assert f"loop and calibrate use {used} of these rows" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("rows", [100, None])

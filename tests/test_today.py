@@ -10,7 +10,6 @@ import mmrjax as api
 from calibration.data import robot_file
 from mmrjax.derived.start_figures import stages_of_start
 from mmrjax.model import paper_robots, signals
-from sweeps.commands.simulate import run_remarks
 from sweeps.pages import figure_style, history_figures, words
 from sweeps.report import runs_report
 from tests.commands import ends, read_json, read_rig
@@ -118,13 +117,6 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
 def test_a_run_may_last_a_day(robot):
     found = api.simulate(robot, api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"
-
-
-def test_remarks_name_the_run_they_are_of(robot):
-    found = api.simulate(robot, api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
-    shown = run_remarks(robot, found.to_dict())
-    assert len(shown) == 2 and shown[0].startswith("run 2: winding_hot: 125 °C are reached after ")
-    assert shown[1].startswith("run 2: winding, long running: none settles")
 
 
 RATED = (

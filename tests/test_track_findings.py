@@ -76,14 +76,6 @@ def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
     assert_allclose(100 * answer.result.slip, [1.8, 5.04], atol=0.15)
 
 
-def test_too_steep_a_slope_slides_it_down(runs):
-    assert runs.q[SLIDING, -1, 0] < -1.0 and runs.result.reading["speed"][SLIDING] < -1.0
-
-
-def test_unpowered_robot_stands_still(runs):
-    assert np.abs(runs.q[UNPOWERED, :, 0]).max() < 1e-4
-
-
 @pytest.mark.parametrize("k", TRACKED)
 @pytest.mark.parametrize("name", ["total_current", "speed"])
 def test_tracked_ripple_has_the_grousers_period(runs, robot, k, name):
@@ -138,33 +130,6 @@ def test_current_peaks_when_a_grouser_touches_down(runs, robot, k):
     assert np.argmax(folded) in (9, 0, 3) and folded.max() < 1.03 * peak
 
 
-def slipping_stages(time, speed, theoretical, speed_static):
-    """First time of sliding beyond V_s, start of uniform travel [s] and mean slip between, of a run from standstill."""
-    slides = theoretical - speed > speed_static
-    last = speed[-max(len(speed) // 10, 1) :].mean()
-    apart = np.nonzero(slides | (np.abs(speed - last) > 0.01 * abs(last)))[0]
-    uniform = time[min(apart[-1] + 1, len(time) - 1)] if len(apart) else time[0]
-    if not slides.any():
-        return np.nan, uniform, 0.0
-    begin = time[np.argmax(slides)]
-    second = (time >= begin) & (time < uniform)
-    return begin, uniform, np.mean(1 - speed[second] / theoretical[second])
-
-
-@pytest.mark.parametrize("k", [*TRACKED, *WHEELED])
-def test_stages_are_starting_slipping_and_uniform(runs, k):
-    """Figs. 23, 24: V_theoretical runs ahead of V while the robot gathers speed, then they meet."""
-    time, speed, theoretical = runs.time[k], series(runs, k, "speed"), series(runs, k, "speed_theoretical")
-    slipping, uniform, slip = slipping_stages(time, speed, theoretical, 0.02)
-    assert 0 < slipping < 0.05 < uniform < 1.1
-    assert slip > 0.2
-    current = series(runs, k, "total_current")
-    second = (time > slipping) & (time < uniform)
-    # the drop at the end of II is the robot catching up; up to there slipping costs current
-    assert current[second].mean() > 1.02 * current[TAIL].mean() or RUNS[k][0] == 1
-    assert abs(1 - speed[TAIL].mean() / theoretical[TAIL].mean()) < 0.05
-
-
 @pytest.mark.parametrize("k", [*TRACKED, *WHEELED])
 def test_reactions_carry_the_weight(runs, k):
     mass, slope = runs.result.mass[k], np.radians(RUNS[k][1])
@@ -194,13 +159,6 @@ def test_belt_is_tight_above_and_slack_below(runs):
     assert tension[7] - tension[0] == pytest.approx(force, rel=0.15)
 
 
-def test_averages_are_over_whole_periods(runs):
-    for k in TRACKED:
-        window = 0.4 * 1.5 * runs.result.theoretical_speed[k]
-        assert runs.steady.periods[k] == int(window / 0.035)
-    assert runs.steady.periods[UNPOWERED] == 0
-
-
 @pytest.mark.nightly
 def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     """Within 1.5 % on current and both speeds, at the share of the weight that the track model puts out.
@@ -223,15 +181,6 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
         a, b = (np.asarray(r.reading[name]) for r in (ours.result, theirs))
         assert_allclose(a, b, rtol=0.015, err_msg=name)
     assert float(jnp.max(jnp.abs(ours.result.reading["total_current"] / theirs.reading["total_current"] - 1))) < 0.005
-
-
-def test_batch_is_its_members(robot):
-    """vmap = loop: a run does not depend on who runs beside it."""
-    two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
-    twin = jax.tree.map(lambda x: x[::-1], two)
-    a = _simulate_batch(robot, two, 0.05, 1e-4, 1e-3, False)
-    b = _simulate_batch(robot, twin, 0.05, 1e-4, 1e-3, False)
-    assert_allclose(a.q, b.q[::-1], rtol=1e-9, atol=1e-12)
 
 
 def test_batch_compiles_once(robot, compilations):

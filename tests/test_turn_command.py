@@ -1,7 +1,6 @@
 """The command `simulate` of a robot whose sides are driven apart."""
 
 import dataclasses
-import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +11,6 @@ from pages import recorded
 import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
-from mmrjax.derived import requirements
 from mmrjax.derived import turning_figures as derived
 from mmrjax.errors import UsageError
 from mmrjax.missions.profile import profile
@@ -22,9 +20,8 @@ from mmrjax.model.quantities import HEAT
 from sweeps.capabilities import UNLIMITED
 from sweeps.commands import simulate
 from sweeps.pages import mission_figures
-from sweeps.pages.figure_style import figure_as_svg
 from sweeps.points.job import showing_turns
-from sweeps.report import check_report, run_tables, runs_report, turn_words
+from sweeps.report import run_tables, runs_report, turn_words
 from tests.commands import ends, read_json, refused, rows, text_file
 
 
@@ -56,15 +53,6 @@ def test_the_track_model_turns_and_leaves_its_path(tmp_path, mmrjax):
     assert float(last["x_mm"]) > 20
     (row,) = rows(tmp_path / "run/runs.csv")
     assert 0.95 < float(row["guide_share"]) < 1
-
-
-def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs():
-    asked = types.SimpleNamespace(quantity=requirements.QUANTITIES["turning_radius_mm"])
-    said = check_report.reached_value_text(types.SimpleNamespace(requirement=asked, value=None, status="not_settled"))
-    assert "no settled turn" in said and "--duration" not in said
-    assert said != check_report.reached_value_text(
-        types.SimpleNamespace(requirement=asked, value=None, status="stalled")
-    )
 
 
 HEADER, SIDED = "configuration,supply_voltage_V,payload_kg,slope_deg,", "duty_left,duty_right"
@@ -251,19 +239,6 @@ def test_a_path_between_places_that_turn_is_an_arc():
     ahead, aside = mission_figures.path_arcs(x, y, yaw)
     assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
     assert np.max(np.diff(aside[:-1])) < 0.11 and (ahead[-1], aside[-1], len(ahead)) == (2.0, 3.0, 34)
-
-
-def test_a_mission_of_which_no_heat_is_known_is_laid_out():
-    """What is said in the place of temperatures leaves room for the curves, and no title runs into the next figure."""
-    time = np.linspace(0.0, 24.0, 9)
-    names = ("theoretical_speed_mm_s", "demanded_speed_mm_s", "slope_deg", "source_voltage_V", "motor_current_left_A")
-    rows = {name: time for name in (*names, "motor_current_right_A", "duty_left", "duty_right")}
-    rows |= {"time_s": time, "slope_deg": 0 * time, "state_of_charge": np.nan * time}
-    fig = mission_figures.draw_mission_course(rows, 12.0, UNLIMITED, False, 2.0)
-    figure_as_svg(fig)
-    assert all(axes.get_position().width > 0.2 for axes in fig.axes)
-    first, second = (axes.title.get_window_extent() for axes in fig.axes[2:4])
-    assert not first.overlaps(second)
 
 
 @pytest.mark.parametrize("cycles", [3, 400])

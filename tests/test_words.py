@@ -1,7 +1,6 @@
 """What is said of data, in words: one sentence for each kind of note, and no kind without one."""
 
 import ast
-import copy
 import dataclasses
 import inspect
 import re
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from synthetic import LOST_MOTION
 
-from calibration.described import describe, report_in_words
+from calibration.described import describe
 from calibration.discovery.formula import Proposal
 from calibration.discovery.loop_notes import (
     AlternativeValue,
@@ -31,7 +30,7 @@ from calibration.inference.fit_notes import AdequacyFinding, Remark, progress_re
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
-from calibration.words import experiment_words, fit_words, loop_words, step_words, table_words
+from calibration.words import experiment_words, loop_words, step_words
 from calibration.words.note_words import NOTES
 from mmrjax.model import channels
 from sweeps import console
@@ -120,12 +119,6 @@ def test_notes_of_a_kind_read_as_recorded(kind):
     assert now == then != []
 
 
-def test_a_callback_for_notes_passes_their_sentences_on():
-    told = []
-    report_in_words(told.append)(SAMPLES[0])
-    assert told == [describe(SAMPLES[0])]
-
-
 def made_in_code():
     """Code of each remark that the code makes, with the names of its values."""
     for file in (ROOT / "calibration").rglob("*.py"):
@@ -147,21 +140,6 @@ def test_each_remark_of_the_code_has_a_sample_and_a_sentence_with_its_values():
             assert names >= {field for _, field, _, _ in string.Formatter().parse(NOTES[code]) if field}, code
         else:
             inspect.signature(NOTES[code]).bind(**dict.fromkeys(names))
-
-
-def test_a_remark_is_a_value_and_its_values_are_attributes():
-    note = Remark("in_pieces", name="a", pieces=2)
-    assert note.pieces == 2 and note == copy.deepcopy(note) and note != Remark("in_pieces", name="a", pieces=3)
-    with pytest.raises(AttributeError, match="remark in_pieces: no value parts"):
-        note.parts  # noqa: B018
-
-
-def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
-    assert describe("as it is") == "as it is"
-    with pytest.raises(TypeError, match="got int; expected a note or a result"):
-        describe(3)
-    with pytest.raises(TypeError, match="got Remark, header; expected"):
-        describe(Remark("held_by_prior", names=("a",)), "header")
 
 
 @pytest.mark.parametrize(
@@ -345,30 +323,6 @@ def test_every_doubt_about_a_mechanism_has_words():
         tuple(f"loss torque that changes with {x}" for x in "abcd"), (), 0.1, 0.0, np.inf, 0.0, run=2, changed="track"
     )
     assert set(none.fails) == set(loop_words.NO_MECHANISM) and all(loop_words.no_mechanism(none).split())
-
-
-def test_statements_are_those_of_results():
-    for found in ADEQUACY:
-        assert found.to_json()["statement"] == found.statement
-        assert found.to_json()["shown_by"] == fit_words.adequacy_finding_in_words(found.shown_by)
-    for found in CLUSTERS:
-        assert found.statement == describe(found) == found.to_json()["statement"]
-
-
-def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
-    """Of several that are zero to rounding the first is named: data are compared as their sentences are."""
-    every = [AdequacyFinding(what="stated"), AdequacyFinding(what="repeats")]
-    every += [
-        AdequacyFinding(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")
-    ]
-    every += [AdequacyFinding(c, "remember") for c in ("motor_speed", "total_current")]
-    assert sorted(every) == sorted(every, key=fit_words.adequacy_finding_in_words)
-
-
-def test_what_would_measure_is_found_by_either_end_of_a_name():
-    assert table_words.would_measure("motor.inductance").startswith("the starting current")
-    assert re.search("faster than V_d", table_words.would_measure("6T2A.ground.friction.dynamic"))
-    assert table_words.would_measure("x.y") == "conditions in which it has an effect"
 
 
 def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(capsys):

@@ -128,12 +128,6 @@ def test_steps_are_those_that_a_person_sets(span, count, step):
     assert last <= span * (1 + menu.ABOUT) < last + step and last / step == pytest.approx(round(last / step))
 
 
-def test_a_temperature_that_nobody_stated_is_not_watched():
-    stated, unknown = (denser_runs_instruction("slip", "time", dataclasses.replace(ONE, hot=t)) for t in (125.0, 1e9))
-    assert "(limit 125 °C)" in describe(stated)
-    assert describe(unknown).count("Watch the winding's temperature. ") == 1
-
-
 @pytest.mark.parametrize("reach", [ONE, BENCH, DRIVEN, BRAKED, HELD])
 @pytest.mark.parametrize(
     "variable", ["voltage", "current", "speed_motor", "speed", "slope", "payload", "time", "order"]

@@ -141,9 +141,3 @@ def test_histories_of_another_robot_agree_with_drive(tmp_path, variety):
     run = Conditions(index, c.U, np.degrees(c.slope), c.payload, total_mass=c.mass)
     times, y = simulated(w, w.constants, c)
     assert apart(y, driven(robot, run, times)) < 1e-4
-
-
-# --- worlds and tables ----------------------------------------------------------------------------------
-
-
-# --- effects --------------------------------------------------------------------------------------------
