@@ -35,7 +35,7 @@ from mmrjax.model.conditions import Conditions
 from sweeps import cli, console
 
 typer.main.get_command = functools.cache(typer.main.get_command)  # the commands are the same in all tests
-console.FIRST = 1e6  # that a command works depends on the time it takes: tests of what is said don't hear it
+console.FIRST_MESSAGE = 1e6  # the message depends on timing, so recorded output must not contain it
 
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
 #: compiler crashes or hangs beyond. A program takes some dozens.

@@ -28,12 +28,12 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [p for p in (str(ROOT), str(ROOT / "tests")) if p not in sys.path]
 
 from mmrjax import SOUND_AT_LEVEL_0  # noqa: E402
-from sweeps.cli import OF_LOOP  # noqa: E402
+from sweeps.cli import LOOP_COMPILER_OPTIONS  # noqa: E402
 
 #: A worker has one thread, so that as many workers as cores share a machine without waiting for each other. Options
 #: of the compiler are those of `mmrjax loop`.
 ALONE = {
-    "XLA_FLAGS": ",".join((SOUND_AT_LEVEL_0, *OF_LOOP))
+    "XLA_FLAGS": ",".join((SOUND_AT_LEVEL_0, *LOOP_COMPILER_OPTIONS))
     + " --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",

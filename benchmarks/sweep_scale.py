@@ -86,7 +86,7 @@ def against_cpu(arguments: argparse.Namespace) -> dict[str, Any]:
     count = job.blocks.count(0)
     found = []
     for devices in (jax.local_devices(), jax.local_devices(backend="cpu")[:1]):
-        compiled = scale.Compiled(job, devices)
+        compiled = scale.CompiledJob(job, devices)
         found.append(scale.fetch_values(compiled(compiled.points(0)), count))
     one, other = found
     differences = {}
@@ -117,7 +117,7 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         Path(arguments.out).mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(dir=arguments.out))
     try:
-        compiled = scale.Compiled(job, devices)
+        compiled = scale.CompiledJob(job, devices)
         begin = time.perf_counter()
         scale.fetch_values(compiled(compiled.points(0)), 1)
         first = time.perf_counter() - begin

@@ -45,22 +45,27 @@ def has_battery(robot: Robot) -> bool:
     """True if the robot has its own battery."""
     if robot.rig.inherits:
         return True
-    nothing, other = Battery(), "battery.current_other"  # `rig_file.DEFAULTS` states that one
-    has_own = any(
-        getattr(robot.battery, name) != value for name, value in vars(nothing).items() if not eqx.is_array(value)
+    default_battery = Battery()
+    own_default = "battery.current_other"  # `rig_file.DEFAULTS` states that one
+    states_value = any(
+        getattr(robot.battery, name) != value
+        for name, value in vars(default_battery).items()
+        if not eqx.is_array(value)
     )
-    return has_own or any(
-        robot.knows([f"battery.{p.name}"]) for p in params.walk_parameters(nothing) if f"battery.{p.name}" != other
+    return states_value or any(
+        robot.knows([f"battery.{p.name}"])
+        for p in params.walk_parameters(default_battery)
+        if f"battery.{p.name}" != own_default
     )
 
 
 def unknown_numbers_sentence(robot: Robot) -> list[str]:
-    """Sentences on results that cannot be computed because the robot's file lacks their parameters."""
+    """Sentence on results that cannot be computed because the robot's file lacks their parameters, if any."""
     unknown_outputs = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
-    lacking = dict.fromkeys(name for output in unknown_outputs for name in robot.unknown(output.rests_on))
+    missing_parameters = dict.fromkeys(name for output in unknown_outputs for name in robot.unknown(output.rests_on))
     labels = "; ".join(output.label for output in unknown_outputs)
     return (
-        [f"cannot be computed: the robot's file does not give {', '.join(lacking)}: {labels}"]
+        [f"cannot be computed: the robot's file does not give {', '.join(missing_parameters)}: {labels}"]
         if unknown_outputs
         else []
     )
@@ -68,24 +73,24 @@ def unknown_numbers_sentence(robot: Robot) -> list[str]:
 
 def inapplicable_columns(robot: Robot) -> set[str]:
     """Columns of runs and histories that do not apply to a robot."""
-    idle: set[str] = set()
+    inapplicable: set[str] = set()
     if not robot.has_ground:
-        idle |= {*OF_GROUND}
+        inapplicable |= {*OF_GROUND}
     if not robot.shows_travel:
-        idle |= {*OF_TRAVEL}
-    idle |= {column for column, names in RESTS_ON.items() if not robot.knows(names)}
-    warm = [column.removesuffix("_C") for column in idle if RESTS_ON.get(column) == WARMING]
-    idle |= {f"{name}_{side}_C" for name in warm for side in SIDES}
+        inapplicable |= {*OF_TRAVEL}
+    inapplicable |= {column for column, names in RESTS_ON.items() if not robot.knows(names)}
+    heat_columns = [column.removesuffix("_C") for column in inapplicable if RESTS_ON.get(column) == WARMING]
+    inapplicable |= {f"{name}_{side}_C" for name in heat_columns for side in SIDES}
     if not has_battery(robot):
-        idle |= {"voltage_cell_V"}
-    return idle
+        inapplicable |= {"voltage_cell_V"}
+    return inapplicable
 
 
 def drop_inapplicable_columns(robot: Robot, table: Columns) -> Columns:
     """Table without the columns that do not apply to the robot. Columns of its channels are kept."""
-    idle = inapplicable_columns(robot) - {c.column for c in robot.channels}
-    ends = ("", "_sd", "_lower", "_upper")
-    dropped = {column + end for column in idle for end in ends}
+    inapplicable = inapplicable_columns(robot) - {c.column for c in robot.channels}
+    endings = ("", "_sd", "_lower", "_upper")
+    dropped = {column + ending for column in inapplicable for ending in endings}
     return {column: values for column, values in table.items() if column not in dropped}
 
 
@@ -177,12 +182,17 @@ def imposed_default(robot: Robot, option: str) -> float:
 
 
 def _stated_limit(robot: Robot, option: str, example: str) -> float:
-    """`imposed_limit` of a file that states it. The refusal has an example of the option."""
-    limit, about = imposed_limit(robot), IMPOSED_WORDS[robot.rig.imposed]
+    """`imposed_limit` of a file that states it. `example`: value of the option, for the error message."""
+    limit = imposed_limit(robot)
+    words_of_quantity = IMPOSED_WORDS[robot.rig.imposed]
     if limit is None:
         # currents are not limited by files
-        missing = f", and the robot's file has no motor.{about.limit}" * (robot.rig.imposed != "motor_current")
-        raise BadConfiguration(f"{option}: not given{missing}; give it [{about.unit}], such as {option} {example}")
+        missing = f", and the robot's file has no motor.{words_of_quantity.limit}" * (
+            robot.rig.imposed != "motor_current"
+        )
+        raise BadConfiguration(
+            f"{option}: not given{missing}; give it [{words_of_quantity.unit}], such as {option} {example}"
+        )
     return limit
 
 
@@ -190,26 +200,30 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
     """Default imposed values of a grid: one third, two thirds and all of the limit, or those of Table 8.
 
     Args:
-        notes: callback for a sentence with these values.
+        notes: list to which a sentence with these values is added, if they follow from a limit.
 
     Raises:
         BadConfiguration: the file states no limit.
     """
     if Layout.of(robot).complete:
         return VOLTAGES_V
-    about = IMPOSED_WORDS[robot.rig.imposed]
-    limit = _stated_limit(robot, option, about.several)
+    words_of_quantity = IMPOSED_WORDS[robot.rig.imposed]
+    limit = _stated_limit(robot, option, words_of_quantity.several)
     levels = tuple(_digits(share * limit) for share in SHARES)
     if notes is not None:
         level_text = ",".join(f"{v:g}" for v in levels)
-        notes.append(f"{option}: not given. Thirds of the {about.limit} in the robot's file are used: {level_text}")
+        notes.append(
+            f"{option}: not given. Thirds of the {words_of_quantity.limit} in the robot's file are used: {level_text}"
+        )
     return levels
 
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
     """Reason for rejecting an option for a quantity that is not imposed."""
-    about = IMPOSED_WORDS[robot.rig.imposed]
-    return f"{option}: the {about.words} is imposed on this robot; give {instead} [{about.unit}]"
+    words_of_quantity = IMPOSED_WORDS[robot.rig.imposed]
+    return (
+        f"{option}: the {words_of_quantity.words} is imposed on this robot; give {instead} [{words_of_quantity.unit}]"
+    )
 
 
 def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> None:
@@ -219,11 +233,11 @@ def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> N
         ground, shaft: options or places in a file that state such conditions.
 
     Raises:
-        BadConfiguration: there is one.
+        BadConfiguration: such a condition is stated.
     """
-    options, why = (shaft, NO_BRAKE) if robot.has_ground else (ground, "has no effect on a shaft")
+    options, reason = (shaft, NO_BRAKE) if robot.has_ground else (ground, "has no effect on a shaft")
     for option in options:
-        raise BadConfiguration(f"{option}: {why}; remove it")
+        raise BadConfiguration(f"{option}: {reason}; remove it")
 
 
 def check_battery(robot: Robot) -> None:
@@ -257,8 +271,8 @@ def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
     Raises:
         BadConfiguration: it cannot turn. The message begins with `where` and gives the reason.
     """
-    if why := turn_error(robot, names):
-        raise BadConfiguration(f"{where}: {why}")
+    if reason := turn_error(robot, names):
+        raise BadConfiguration(f"{where}: {reason}")
 
 
 def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], where: str) -> None:
@@ -268,8 +282,8 @@ def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], w
         stated: names of conditions.
         names: names of the configurations that are simulated.
     """
-    if not (freed := [name for name in OF_TURNS if name in stated]):
+    if not (turn_conditions := [name for name in OF_TURNS if name in stated]):
         return
-    check_can_turn(robot, names, f"{where}, {freed[0]}")
-    if why := sides_contradiction(stated):
-        raise BadConfiguration(f"{where}, {why}")
+    check_can_turn(robot, names, f"{where}, {turn_conditions[0]}")
+    if reason := sides_contradiction(stated):
+        raise BadConfiguration(f"{where}, {reason}")

@@ -21,8 +21,7 @@ from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, InputError
 from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
 from mmrjax.errors import printable, shorten
-from sweeps import config, config_campaign
-from sweeps import options as made
+from sweeps import config, config_campaign, options
 
 INTERRUPTED = 130
 
@@ -63,13 +62,13 @@ _Columns = Annotated[
 
 
 def _command(
-    kind: type[config.Part],
-    beside: type[config.Part],
+    config_kind: type[config.Part],
+    invocation_kind: type[config.Part],
     *,
     group: str,
     common: str,
     example: str,
-    room: str = "",
+    module: str = "",
     failure: str = "the solver failed at some runs. Runs that stall or slide give 0",
     resolve: Callable[..., config.Part] | None = None,
 ) -> Callable[[Callable[[], None]], None]:
@@ -78,53 +77,58 @@ def _command(
     The command is the function `execute` of its module in `commands`, called with both once jax is ready.
 
     Args:
-        kind: the configuration.
-        beside: type of the options that change no number.
+        config_kind: type of the configuration.
+        invocation_kind: type of the inputs, output folder and other options that are not part of it.
         group: heading in `--help`.
         common: options that `--help` shows, in this order. `--help-all` shows all.
-        room: the module, if it has another name.
+        module: name of the module, if it is not that of the command.
         failure: meaning of exit code 3.
-        resolve: in place of `config.resolve_configuration`.
+        resolve: function to use instead of `config.resolve_configuration`.
     """
 
-    def of(described: Callable[[], None]) -> None:
-        name = described.__name__
+    def decorate(described_command: Callable[[], None]) -> None:
+        name = described_command.__name__
 
-        def run(**given: Any) -> int:
+        def run(**arguments: Any) -> int:
             from sweeps.console import report_working
 
-            file, plan, trust = given["config_file"], given.get("plan"), given["trust"]
+            file = arguments["config_file"]
+            plan = arguments.get("plan")
+            trust = arguments["trust"]
             if plan is not None and file is not None:
                 raise InputError(f"--config: got {file} in addition to {plan}; give one of them")
             file = plan if file is None else file
-            if "plan" in given:
-                given["plan"] = file
-            stated, others = made.take_options(kind, given), made.take_options(beside, given)
-            aside = config.resolve_configuration(beside, None, others)
+            if "plan" in arguments:
+                arguments["plan"] = file
+            config_values = options.take_options(config_kind, arguments)
+            invocation_values = options.take_options(invocation_kind, arguments)
+            invocation = config.resolve_configuration(invocation_kind, None, invocation_values)
             if resolve is None:
-                resolved = config.resolve_configuration(kind, file, stated, trust)
+                resolved_config = config.resolve_configuration(config_kind, file, config_values, trust)
             else:
-                resolved = resolve(file, stated, trust)
+                resolved_config = resolve(file, config_values, trust)
             with report_working(name):
-                _prepare_environment(resolved, given["no_cache"])
-                code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(resolved, aside)
+                _prepare_environment(resolved_config, arguments["no_cache"])
+                code: int = importlib.import_module(f"sweeps.commands.{module or name}").execute(
+                    resolved_config, invocation
+                )
                 return code
 
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
-        everything = [
-            *made.option_parameters((beside, kind), common.split()),
+        parameters = [
+            *options.option_parameters((invocation_kind, config_kind), common.split()),
             keyword("config_file", annotation=_Config, default=None),
             keyword("trust", annotation=_Trust, default=False),
             keyword("no_cache", annotation=_NoCache, default=False),
-            made.help_all(),
+            options.help_all(),
         ]
-        lines_joined = re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.getdoc(described) or "")
-        run.__name__, run.__doc__ = name, lines_joined
-        run.__signature__ = inspect.Signature(everything)  # type: ignore[attr-defined]
-        run.__annotations__ = {p.name: p.annotation for p in everything}
+        help_text = re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.getdoc(described_command) or "")
+        run.__name__, run.__doc__ = name, help_text
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
         app.command(epilog=f"Example: {example}\n\nExit code 3: {failure}.", rich_help_panel=group)(run)
 
-    return of
+    return decorate
 
 
 #: Headings of commands in `--help`, in their order there.
@@ -397,7 +401,7 @@ def size() -> None:
     common="to data configuration joint out",
     example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
     failure="does not occur",
-    room="export_drive",
+    module="export_drive",
 )
 def export() -> None:
     """Write the drive for MuJoCo, JAX, ONNX and others.
@@ -430,7 +434,7 @@ def new(
         typer.Option(
             help=(
                 "tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  \\[default: from --from, "
-                "else bench]"
+                "otherwise bench]"
             )
         ),
     ] = None,
@@ -465,17 +469,17 @@ def new(
     unless a comment states another.
 
     --kind chooses the kind of rig. --from reads mass, inertia, radius, ratio, friction, damping and armature of a
-    joint from a model. --from-sheet reads a motor from four to six numbers with units, and refuses numbers that
+    joint from a model. --from-sheet reads a motor from four to six numbers with units. It refuses numbers that
     contradict each other by more than 10 %. Both can be combined. Each number gets its source and a wide ±. The
     command lists what is missing.
     """
     from sweeps.commands import rig_new
 
-    given = {
+    sheet_options = {
         "voltage": voltage, "no-load-speed": no_load_speed, "no-load-current": no_load_current,
         "stall-torque": stall_torque, "stall-current": stall_current, "resistance": resistance,
     }  # fmt: skip
-    sheet = {name: text for name, text in given.items() if text is not None}
+    sheet = {name: text for name, text in sheet_options.items() if text is not None}
     return rig_new.write_new_rig(file, kind, force, source, joint, sheet if sheet or from_sheet else None)
 
 
@@ -500,9 +504,9 @@ def rig_check(
     usable.
     """
     _start_jax(no_cache)
-    from sweeps.commands import rig_check as room
+    from sweeps.commands import rig_check as rig_check_command
 
-    return room.check_rig_file(file, data, tuple(effects or ()), json, columns, verbose)
+    return rig_check_command.check_rig_file(file, data, tuple(effects or ()), json, columns, verbose)
 
 
 @app.command(
@@ -516,9 +520,9 @@ def inspect_file(
 
     Signals have units, rates, ranges and gaps. Exit codes: 0 readable, 4 not readable.
     """
-    from sweeps.commands import inspect as room
+    from sweeps.commands import inspect as inspect_command
 
-    return room.inspect_file(file, json)
+    return inspect_command.inspect_file(file, json)
 
 
 @app.command(rich_help_panel=ELSEWHERE, epilog="Example: mmrjax explain series_resistance")
@@ -535,39 +539,41 @@ def explain(
     Prints its equation, source, typical size, signature in data and a test for it.
     """
     _start_jax(no_cache)
-    from sweeps.commands import explain as room
+    from sweeps.commands import explain as explain_command
 
-    return room.explain_name(" ".join(name) if name else None, tuple(effects or ()))
+    return explain_command.explain_name(" ".join(name) if name else None, tuple(effects or ()))
 
 
-def _prepare_environment(resolved: Any, no_cache: bool = False) -> None:
+def _prepare_environment(config_of_command: Any, no_cache: bool = False) -> None:
     """Prepares the process before a command with this configuration imports jax.
 
     With several threads, one sweep of the track model in seven hung forever on two cores, with every thread asleep in
     XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). XLA_FLAGS set by the
     user, even if empty, takes precedence.
     """
-    model = getattr(resolved, "model", None)  # a fidelity; of a calibration, whose data decide, None
+    model = getattr(config_of_command, "model", None)  # None for a calibration whose model depends on the data
     one_thread = isinstance(model, str) and fidelities.fidelity_facts(model).one_thread
-    options = (
-        OF_LOOP if isinstance(resolved, config.Loop) else (OLDER_EMITTERS,) * isinstance(resolved, config.Calibrate)
+    compiler_options = (
+        LOOP_COMPILER_OPTIONS
+        if isinstance(config_of_command, config.Loop)
+        else (OLDER_EMITTERS,) * isinstance(config_of_command, config.Calibrate)
     )
-    _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, options)
+    _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, compiler_options)
 
 
-#: Options of the compiler for `loop`. A loop within a program is compiled as one function up to this size [bytes]. In
-#: another one each turn hands some hundred operations to the executor, which is most of the time of a run over time.
-OF_LOOP = ("xla_cpu_small_while_loop_byte_threshold=1000000", OLDER_EMITTERS)
+#: Compiler options of `loop`. XLA compiles a loop of a program as one function up to this size [bytes]. For larger
+#: loops, each iteration passes some hundred operations to the executor, which takes most of the time of a run.
+LOOP_COMPILER_OPTIONS = ("xla_cpu_small_while_loop_byte_threshold=1000000", OLDER_EMITTERS)
 
 
-def _start_jax(no_cache: bool, flags: Names = (), options: Names = ()) -> None:
-    """Import jax with double precision, XLA flags and the compilation cache, unless `no_cache`.
+def _start_jax(no_cache: bool, flags: Names = (), compiler_options: Names = ()) -> None:
+    """Imports jax with double precision, XLA flags and, unless `no_cache`, the compilation cache.
 
     Compiler options are added to that of `SOUND_AT_LEVEL_0`.
     """
     _refuse_little_memory()
-    if "jax" not in sys.modules:  # which takes it when it starts
-        flags = ",".join((SOUND_AT_LEVEL_0, *options)), *flags
+    if "jax" not in sys.modules:  # jax reads the flag when it is imported
+        flags = ",".join((SOUND_AT_LEVEL_0, *compiler_options)), *flags
     if flags:
         os.environ.setdefault("XLA_FLAGS", " ".join(flags))
     from sweeps import compilation_cache
@@ -581,7 +587,7 @@ def _start_jax(no_cache: bool, flags: Names = (), options: Names = ()) -> None:
     jax.config.update("jax_enable_x64", True)
 
 
-#: Smallest limit of address space with which one run can be simulated [bytes]: below, libraries abort the process.
+#: Smallest limit of the address space [bytes]. With less, libraries abort the process.
 LEAST_MEMORY = 2_000_000_000
 
 
@@ -599,41 +605,43 @@ def _refuse_little_memory() -> None:
 
 
 def main() -> None:
-    """Run the command line. Every failure is one sentence on stderr and a documented exit code."""
-    # NumPy takes it when it starts. Threads of a small factorisation wait for each other: 3 s for 0.04 s under load.
+    """Runs the command line. Every failure is one sentence on stderr and a documented exit code."""
+    # NumPy reads this when it is imported. With several threads, a small factorisation takes 3 s instead of 0.04 s
+    # under load, because the threads wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for number in (signal.SIGTERM, signal.SIGALRM):  # ended or interrupted: both can be taken up again
+    for number in (signal.SIGTERM, signal.SIGALRM):  # handled like Ctrl-C, so that the command can be resumed
         signal.signal(number, signal.default_int_handler)
-    unraised, sys.unraisablehook = sys.unraisablehook, _raise_lost_interrupt
+    previous_hook = sys.unraisablehook
+    sys.unraisablehook = _raise_lost_interrupt
     _replace_closed_streams()
     try:
-        # Refuse names that are not UTF-8: neither pages nor JSON could show them
+        # Names that are not UTF-8 are rejected, because neither pages nor JSON could show them
         for argument in sys.argv[1:]:
             if not argument.isprintable() and any("\ud800" <= c <= "\udfff" for c in argument):
-                shown = argument.encode("utf-8", "replace").decode()
-                raise BadConfiguration(f"{shown}: is not in UTF-8; rename the file or folder")
+                readable = argument.encode("utf-8", "replace").decode()
+                raise BadConfiguration(f"{readable}: is not in UTF-8; rename the file or folder")
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # the option parser has caught the interrupt
             raise KeyboardInterrupt
     except BaseException as error:
         code = _report_failure(error)
     signal.setitimer(signal.ITIMER_REAL, 0)
-    sys.unraisablehook = unraised
+    sys.unraisablehook = previous_hook
     code = code if isinstance(code, int) else 0
-    lost = []
+    failed_streams = []
     for stream in (sys.stderr, sys.stdout):
         try:
             stream.flush()
-        except OSError as error:  # Python would try again as it ends
-            lost.append(stream)
+        except OSError as error:  # Python would flush again at exit
+            failed_streams.append(stream)
             if code == 0 and stream is sys.stdout:
                 code = (
                     1 if isinstance(error, BrokenPipeError) else _print_failure(f"{stream.name}: {error.strerror}", 2)
                 )
-    working = any(t.name.startswith(WORKER) for t in threading.enumerate())  # for whom nobody waits
-    spent = code == 3 and "loop" in sys.argv[1:2]  # perhaps out of time, which interrupts a step too
-    # XLA may still be at work, and has crashed when Python was taken down around it
-    if code == INTERRUPTED or spent or working or lost:
+    has_worker = any(t.name.startswith(WORKER) for t in threading.enumerate())  # daemon threads
+    is_loop_out_of_time = code == 3 and "loop" in sys.argv[1:2]  # possibly interrupted in a step by --within
+    # XLA may still be running, and has crashed while Python was shutting down
+    if code == INTERRUPTED or is_loop_out_of_time or has_worker or failed_streams:
         os._exit(code)
     sys.exit(code)
 
@@ -660,30 +668,32 @@ def _replace_closed_streams() -> None:
 
 
 def _report_failure(error: BaseException) -> int:
-    """Report why a command failed. Returns its exit code."""
+    """Reports why a command failed. Returns its exit code."""
     if isinstance(error, typer.Abort) and isinstance(error.__context__, EOFError):
-        error = error.__context__  # of a file, which the option parser takes for the end of its own input
+        error = error.__context__  # raised by a file, but the option parser mistakes it for the end of its own input
     if isinstance(error, InputError):
         return _print_failure(str(error), error.exit_code)
     if isinstance(error, typer.Abort | KeyboardInterrupt):
-        kept = {
+        resume_point = {
             "sweep": "after the last complete chunk",
             "calibrate": "a population after its last generation",
             "loop": "after the last complete stage",
         }
-        resumed = [kept[command] for command in sys.argv[1:2] if command in kept]
-        advice = f"the same command with --out continues {resumed[0]}" if resumed else "no run folder was written"
+        points = [resume_point[command] for command in sys.argv[1:2] if command in resume_point]
+        advice = f"the same command with --out continues {points[0]}" if points else "no run folder was written"
         return _print_failure(f"interrupted; {advice}", INTERRUPTED)
     if _memory_exhausted(error):
         return _print_failure("out of memory; use a smaller --chunk, fewer rows, or more memory", 2)
     if isinstance(error, OSError):
         from sweeps.console import OUTPUT
 
-        place = str(error.filename or OUTPUT)  # run folders and tables name theirs
-        left = "" if place == OUTPUT else "; no run folder was written; finished parts are in the .partial folder"
-        return _print_failure(f"{place}: {error.strerror}{left}", 2)
+        place = str(error.filename or OUTPUT)  # run folders and tables name their file
+        remaining = (
+            "" if place == OUTPUT else "; no run folder was written; finished parts are in the .partial folder"
+        )
+        return _print_failure(f"{place}: {error.strerror}{remaining}", 2)
     if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
-        return 1  # whoever reads the output has had enough: head, or a pager that was left
+        return 1  # the reader of the output has closed it, for example head or a pager
     if isinstance(error, SystemExit):
         return _print_failure("--effects: a file's code ended the program; remove that call", 2)
     if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
@@ -698,8 +708,8 @@ def _report_failure(error: BaseException) -> int:
 def _memory_exhausted(error: BaseException | None) -> bool:
     """True if an error, or one of its causes, is a lack of memory in Python, XLA or the library loader."""
     while error is not None:
-        out = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
-        if out or (isinstance(error, ImportError) and "failed to map segment" in str(error)):
+        is_memory_error = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+        if is_memory_error or (isinstance(error, ImportError) and "failed to map segment" in str(error)):
             return True
         error = error.__cause__ or error.__context__
     return False
@@ -715,6 +725,6 @@ def _not_a_number_message(error: Any) -> str:
 
 
 def _print_failure(message: str, code: int) -> int:
-    with contextlib.suppress(OSError):  # of a standard error that takes no more
+    with contextlib.suppress(OSError):  # standard error is closed or its disk is full
         print(f"mmrjax: {shorten(printable(' '.join(message.splitlines())))}", file=sys.stderr)
     return code

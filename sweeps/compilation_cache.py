@@ -1,9 +1,10 @@
 """Compilation cache: programs compiled by XLA, stored on disk so that later processes can read them.
 
-Folder: `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`. `MMRJAX_CACHE=off` switches it off.
-JAX keys an entry by program, compiler version, flags and device. A folder of its own for each version of jaxlib and
-each kind of processor keeps native code of one machine from another with the same home. Programs are native code: a
-folder that others could change is not used (`mmrjax.compile.programs`). Importable without jax.
+The folder is `$MMRJAX_CACHE`, otherwise `$XDG_CACHE_HOME/mmrjax`, otherwise `~/.cache/mmrjax`. `MMRJAX_CACHE=off`
+switches it off. JAX keys an entry by program, compiler version, flags and device. Each version of jaxlib and each
+kind of processor has its own subfolder, because machines with different processors may share a home. Programs are
+native code, so a folder that others could change is not used (`mmrjax.compile.programs`). This module can be imported
+without jax.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from pathlib import Path
 from mmrjax.compile.programs import exposure_reason
 
 VARIABLE = "MMRJAX_CACHE"
-#: The same of `mmrjax.compile.programs`, which finds programs that were kept whole there; empty to keep none so.
+#: Variable from which `mmrjax.compile.programs` reads the folder for whole programs. Empty: none are stored.
 PROGRAMS = "MMRJAX_PROGRAMS"
 OFF = ("off", "0", "no", "false")
-#: Size beyond which the oldest entries are dropped when the cache is enabled, down to half of it [bytes].
+#: Size of the cache [bytes] beyond which its oldest entries are deleted when it is enabled, down to half of this.
 LIMIT = 4 * 2**30
 
 
 def cache_location() -> Path | None:
-    """Folder of the cache, which need not exist yet. None if the cache is switched off or has no known place."""
+    """Folder of the cache, which may not exist yet. None if the cache is switched off or there is no home folder."""
     folder_text = os.environ.get(VARIABLE, "").strip()
     if folder_text.lower() in OFF:
         return None
@@ -36,48 +37,46 @@ def cache_location() -> Path | None:
     path = Path(folder_text or (base if base.is_absolute() else Path("~/.cache")) / "mmrjax")
     try:
         path = path.expanduser()
-    except RuntimeError:  # nobody's home
+    except RuntimeError:  # the user has no home folder
         return None
-    # Native code depends on the features of the processor.
+    # The subfolder depends on the features of the processor, as native code does.
     try:
         flags = re.findall(r"^(?:flags|Features)\s*:.*", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)[:1]
     except OSError:
         flags = []
-    kind = " ".join([platform.machine(), platform.processor(), *flags])
-    processor = f"{platform.machine()}-{hashlib.sha256(kind.encode()).hexdigest()[:8]}"
+    processor_text = " ".join([platform.machine(), platform.processor(), *flags])
+    processor = f"{platform.machine()}-{hashlib.sha256(processor_text.encode()).hexdigest()[:8]}"
     return path / f"xla-{importlib.metadata.version('jaxlib')}-{processor}"
 
 
 def keep_programs() -> Path | None:
-    """Keep every compiled program, however small, and read programs kept by earlier processes, as the commands do.
+    """Enables the cache for every compiled program, however small. Call it before anything compiles.
 
-    To be called before anything compiles. A cache that JAX has been given by its own settings
-    (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again. `MMRJAX_CACHE` is the folder
-    to hold caches, or `off`, without it `~/.cache/mmrjax`. A folder that other users could change is not used, which
-    a line on stderr reports.
+    A cache in JAX's own settings (`JAX_COMPILATION_CACHE_DIR`) takes precedence. An entry that cannot be read is
+    compiled again. If other users could change the folder, it is not used, and a line on stderr reports this.
 
     Returns:
-        The folder, None if the cache is switched off, its place cannot be written to or others could change it.
+        The folder. None if the cache is switched off, or the folder cannot be written or could be changed by others.
     """
     if _is_unsafe(os.environ.get(PROGRAMS, "")):
         os.environ[PROGRAMS] = ""
     folder = cache_location()
     if folder is None:
         return None
-    # On some processors XLA logs an error for each program that it reads: tuning flags of its own compiler that it
-    # takes for features of another machine (openxla/xla issue 44565). What fails is raised, not only logged.
+    # On some processors XLA logs an error for each program that it reads. It mistakes tuning flags of its own
+    # compiler for features of another machine (openxla/xla issue 44565). Real failures are also raised.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    # Checks inside of diffrax that raise hold a host callback, and such a program is never kept: what they check
-    # (times that increase) is right by construction here, and a wrong one would give NaN.
+    # Checks of diffrax that raise contain a host callback, and JAX does not store such programs. They check that
+    # times increase, which holds by construction here. Otherwise the result would be NaN.
     os.environ.setdefault("EQX_ON_ERROR", "nan")
     import jax
 
-    own_folder = jax.config.values["jax_compilation_cache_dir"]
-    if own_folder is not None:
-        if "://" not in own_folder and _is_unsafe(own_folder):
+    jax_folder = jax.config.values["jax_compilation_cache_dir"]
+    if jax_folder is not None:
+        if "://" not in jax_folder and _is_unsafe(jax_folder):
             jax.config.update("jax_enable_compilation_cache", False)
             return None
-        return Path(own_folder)
+        return Path(jax_folder)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError:
@@ -95,7 +94,7 @@ def keep_programs() -> Path | None:
 
 
 def _is_unsafe(folder: str) -> bool:
-    """True if other users could change a folder of compiled programs and so run their code. This is reported."""
+    """True if other users could change a folder of compiled programs, and thus run their code. Prints a message."""
     reason = exposure_reason(Path(folder)) if folder else ""
     if reason:
         from sweeps.console import print_message
@@ -112,32 +111,32 @@ def _cache_entries(folder: Path) -> list[tuple[float, int, Path]]:
     for path in folder.iterdir() if folder.is_dir() else ():
         try:
             state = path.stat()
-        except OSError:  # dropped by another process meanwhile
+        except OSError:  # deleted by another process meanwhile
             continue
-        if stat.S_ISREG(state.st_mode):  # XLA has a folder of its own there, with a GPU
+        if stat.S_ISREG(state.st_mode):  # with a GPU, XLA keeps its own folder there
             entries.append((state.st_mtime, state.st_size, path))
     return entries
 
 
 def _delete_oldest(caches: Path) -> None:
-    """Delete the oldest entries of all versions if there are too many."""
+    """Deletes the oldest entries of all versions if the cache is larger than `LIMIT`."""
     entries = [entry for folder in caches.glob("xla-*") for entry in _cache_entries(folder)]
     size = sum(entry[1] for entry in entries)
     if size <= LIMIT:
         return
-    for _, bytes_, path in sorted(entries):
+    for _, entry_size, path in sorted(entries):
         path.unlink(missing_ok=True)
-        size -= bytes_
+        size -= entry_size
         if size <= LIMIT / 2:
             return
 
 
 def describe_cache() -> str:
-    """Folder of the cache with number and size of its programs, or why it is not used."""
+    """Folder of the cache with number and size of its programs, or the reason for not using it."""
     folder = cache_location()
     if folder is None:
         return f"off ({VARIABLE}=off)" if os.environ.get(VARIABLE) else "off"
-    if exposed := exposure_reason(folder):
-        return f"{folder}: not used, since {exposed}"
+    if reason := exposure_reason(folder):
+        return f"{folder}: not used, since {reason}"
     entries = _cache_entries(folder)
     return f"{folder}: {len(entries)} programs, {sum(entry[1] for entry in entries) / 1e6:.1f} MB"

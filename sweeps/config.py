@@ -28,13 +28,13 @@ def number_between(low: float, high: float) -> Any:
     return Field(ge=low, le=high, allow_inf_nan=False)
 
 
-def positive_number(most: float) -> Any:
+def positive_number(high: float) -> Any:
     """Bounds of a finite number above 0."""
-    return Field(gt=0, le=most, allow_inf_nan=False)
+    return Field(gt=0, le=high, allow_inf_nan=False)
 
 
 T = TypeVar("T")
-Several = Annotated[tuple[T, ...], Field(min_length=1)]
+NonEmpty = Annotated[tuple[T, ...], Field(min_length=1)]
 Slope = Annotated[float, number_between(*CONDITIONS["slope_deg"].range)]
 Payload = Annotated[float, number_between(*CONDITIONS["payload"].range)]
 LoadTorque = Annotated[float, number_between(*CONDITIONS["load_torque"].range)]
@@ -44,23 +44,24 @@ Heading = Annotated[float, number_between(*CONDITIONS["heading_deg"].range)]
 MotorCurrent = Annotated[float, number_between(*channels.find_channel("motor_current").range)]
 MotorSpeed = Annotated[float, number_between(*channels.find_channel("motor_speed").range)]
 #: The fidelity that follows profiles.
-PROFILED = "drive"
-#: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
-SHOWN = 5.0
+PROFILE_MODEL = "drive"
+#: Longest default duration of `simulate` [s], short enough for a figure to show the start.
+SHORT_RUN = 5.0
 PaperSurface = Literal[tuple(SURFACES)]  # type: ignore[valid-type]  # names of a table
 Seed = Annotated[int, Field(ge=0, le=SEEDS)]
 
 
 def option_field(default: Any, description: str, **extra: Any) -> Any:
-    """Field with its description. Options, their help and the schema are made from it (`sweeps.options`).
+    """Field with its description. `sweeps.options` makes options, their help and the schema from it.
 
     Args:
         default: value if not stated.
         description: meaning without the unit (the name ends with the unit).
-        extra: `usual`, the meaning of a default of None, in words. `flag`, its option, if it differs from its name.
-            `verbatim`, a list each of whose texts may have commas. `metavar` of an argument. `format`, such as path.
-            `minimum`, where the command asks for more than the field. `executes`, whose value is code that is run,
-            or leads to such: a file may state it with `--trust` only. `argument`, if it is no option.
+        extra: further properties. `usual`: meaning of the default None, in words. `flag`: option, if it differs from
+            the name. `verbatim`: True if texts of a list may contain commas. `metavar`: name of an argument in help.
+            `format`: such as path. `minimum`: bound of the command, if it is above that of the field. `executes`:
+            True if the value names code to run, which a file may do only with `--trust`. `argument`: True for an
+            argument, False for an option.
     """
     return Field(default=default, description=description, json_schema_extra=extra or None)
 
@@ -74,7 +75,7 @@ class Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     #: Two fields that cannot be combined, and the end of the message.
     exclusive: ClassVar[Rules] = ()
-    #: A field, another one that it needs, and what the message says of it.
+    #: A field, another one that it needs, and the end of the message.
     needed: ClassVar[Rules] = ()
 
     def states(self, name: str) -> bool:
@@ -85,12 +86,12 @@ class Part(BaseModel):
     @model_validator(mode="after")
     def _combined(self) -> Self:
         parts = [vars(part) for part in type(self).__mro__]
-        for one, other, text in (rule for part in parts for rule in part.get("needed", ())):
-            if self.states(one) and not self.states(other):
-                raise combination_error(f"`{one}` {text}")
-        for one, other, *more in (rule for part in parts for rule in part.get("exclusive", ())):
-            if self.states(one) and self.states(other):
-                raise combination_error(f"`{one}` cannot be combined with `{other}`{''.join(more)}")
+        for field, other_field, text in (rule for part in parts for rule in part.get("needed", ())):
+            if self.states(field) and not self.states(other_field):
+                raise combination_error(f"`{field}` {text}")
+        for field, other_field, *more in (rule for part in parts for rule in part.get("exclusive", ())):
+            if self.states(field) and self.states(other_field):
+                raise combination_error(f"`{field}` cannot be combined with `{other_field}`{''.join(more)}")
         return self
 
 
@@ -112,14 +113,14 @@ class RobotPart(Part):
 
 
 class FolderPart(Part):
-    """Run folder of a command. It changes no number."""
+    """Run folder of a command. It does not affect results."""
 
     out: Path | None = option_field(None, "The run folder", usual="runs/COMMAND-TIME")
     force: bool = option_field(False, "Replace an existing run folder")
 
 
 class VerbosePart(FolderPart):
-    """Amount of text that a command prints. It changes no number."""
+    """Amount of text that a command prints. It does not affect results."""
 
     verbose: bool = option_field(False, "Print every table and remark")
 
@@ -183,7 +184,7 @@ def _join_with_or(names: Iterable[str]) -> str:
 
 
 def _fidelities_with_option(option: str) -> dict[str, fidelities.Option]:
-    """The fidelities that have an option, with their kind of it."""
+    """Fidelities that have an option, each with its own version of it."""
     return {name: o for name, facts in fidelities.TABLE.items() for o in facts.options if o.name == option}
 
 
@@ -191,10 +192,10 @@ def _largest_value(option: str) -> float:
     return max(o.most for o in _fidelities_with_option(option).values())
 
 
-def _default_text(option: str, shown: float = math.inf) -> str:
-    """Default of a fidelity's option by fidelity. Of `simulate` at most `shown`."""
+def _default_text(option: str, longest: float = math.inf) -> str:
+    """Default of an option for each fidelity. `simulate` uses at most `longest`."""
     defaults = {name: o.default for name, o in _fidelities_with_option(option).items()}
-    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in defaults.items()}
+    capped = {name: f"{v:g}" + (f", simulate {longest:g}" if v > longest else "") for name, v in defaults.items()}
     return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(defaults) > 1 else capped.values())
 
 
@@ -202,9 +203,9 @@ Duration = Annotated[float, positive_number(_largest_value("duration"))]
 
 
 class FidelityPart(ModelPart):
-    """Fidelity of the simulation and its options. None takes the fidelity's default."""
+    """Fidelity of the simulation and its options. None: the fidelity's default."""
 
-    duration_s: Duration | None = option_field(None, "Length of a run", usual=_default_text("duration", SHOWN))
+    duration_s: Duration | None = option_field(None, "Length of a run", usual=_default_text("duration", SHORT_RUN))
     step_s: Annotated[float, positive_number(_largest_value("step"))] | None = option_field(
         None, "Integration step", usual=_default_text("step")
     )
@@ -212,14 +213,19 @@ class FidelityPart(ModelPart):
     @model_validator(mode="after")
     def _acts(self) -> Self:
         for name in ("duration", "step"):
-            value, having = getattr(self, f"{name}_s"), _fidelities_with_option(name)
+            value = getattr(self, f"{name}_s")
+            fidelities_with_it = _fidelities_with_option(name)
             if value is None:
                 continue
-            if self.model not in having and value not in {option.default for option in having.values()}:
-                raise combination_error(f"`{name}_s` has an effect only with `model` {_join_with_or(having)}")
-            if self.model in having and value > having[self.model].most:
-                most = f"{having[self.model].most:g} {having[self.model].unit}"
-                raise combination_error(f"`{name}_s`: got {value:g}; `model` {self.model} allows at most {most}")
+            if self.model not in fidelities_with_it and value not in {
+                option.default for option in fidelities_with_it.values()
+            }:
+                raise combination_error(
+                    f"`{name}_s` has an effect only with `model` {_join_with_or(fidelities_with_it)}"
+                )
+            if self.model in fidelities_with_it and value > fidelities_with_it[self.model].most:
+                limit = f"{fidelities_with_it[self.model].most:g} {fidelities_with_it[self.model].unit}"
+                raise combination_error(f"`{name}_s`: got {value:g}; `model` {self.model} allows at most {limit}")
         return self
 
     @property
@@ -230,7 +236,7 @@ class FidelityPart(ModelPart):
 
 
 class BatchPart(FidelityPart):
-    """Number of runs in one batch. None takes the fidelity's."""
+    """Number of runs in one batch. None: the fidelity's default."""
 
     chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
         None,
@@ -262,9 +268,9 @@ def _values_text(values: Iterable[float]) -> str:
 
 
 class OneRun(Part):
-    """Conditions of one run, by the columns of tables of runs. None: decided by the robot.
+    """Conditions of one run, by the columns of tables of runs. None: the robot's default.
 
-    The run itself checks its values (`inputs.one_run`), like a row of a table.
+    `inputs.one_run` checks the values like those of a row of a table.
     """
 
     configuration: str | None = option_field(None, "Configuration, such as 6T2A or 4W2T", usual="its first")
@@ -324,31 +330,31 @@ class AxesPart(Part):
     slope and surface apply to vehicles only.
     """
 
-    configurations: Several[str] | None = option_field(
+    configurations: NonEmpty[str] | None = option_field(
         None, "Configurations, comma-separated", usual="all configurations"
     )
-    voltages_V: Several[Voltage] | None = option_field(
+    voltages_V: NonEmpty[Voltage] | None = option_field(
         None,
         "Supply voltages (V). Default of a rig: thirds of voltage_limit",
         usual=_values_text(VOLTAGES_V),
     )
-    motor_speeds_rpm: Several[MotorSpeed] | None = option_field(
+    motor_speeds_rpm: NonEmpty[MotorSpeed] | None = option_field(
         None, "Imposed motor speeds (rpm)", usual="thirds of speed_limit"
     )
-    payloads_kg: Several[Payload] | None = option_field(
+    payloads_kg: NonEmpty[Payload] | None = option_field(
         None, "Additional load masses (kg)", usual=_values_text(PAYLOADS_KG)
     )
-    slopes_deg: Several[Slope] | None = option_field(
+    slopes_deg: NonEmpty[Slope] | None = option_field(
         None, "Slopes (deg), positive uphill. Default of a rig: 0", usual=_values_text(SLOPES_DEG)
     )
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; for a rig none")
 
 
 class GridPart(AxesPart):
-    """Axes of a grid, those of shafts and imposed currents among them."""
+    """Axes of a grid, including those of shafts and imposed currents."""
 
-    motor_currents_A: Several[MotorCurrent] | None = option_field(None, "Imposed currents per motor (A)")
-    load_torques_Nm: Several[LoadTorque] | None = option_field(
+    motor_currents_A: NonEmpty[MotorCurrent] | None = option_field(None, "Imposed currents per motor (A)")
+    load_torques_Nm: NonEmpty[LoadTorque] | None = option_field(
         None, "Brake torques at each output (N·m), for a shaft", usual="none"
     )
 
@@ -371,11 +377,11 @@ class InferencePart(Part):
 
 
 class FittedRuns(Measured, VerbosePart):
-    """Options of `calibrate` that change no number."""
+    """Data and output of `calibrate`."""
 
 
 class LoopBeside(FittedRuns):
-    """Options of the loop that change no number."""
+    """Data, output and time limit of `loop`."""
 
     within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] = option_field(
         "10min", "Wall-clock limit, such as 90s, 5min or 1h"
@@ -440,15 +446,15 @@ class ProfilePart(FidelityPart):
     @classmethod
     def _follows(cls, values: Any) -> Any:
         if isinstance(values, dict) and values.get("profile") is not None:
-            return {"model": PROFILED, **values}
+            return {"model": PROFILE_MODEL, **values}
         return values
 
     exclusive: ClassVar[Rules] = (("duration_s", "profile", ", which sets the duration"),)
 
     @model_validator(mode="after")
     def _profiled(self) -> Self:
-        if self.profile is not None and self.model != PROFILED:
-            raise combination_error(f"`profile` has an effect only with `model` {PROFILED}; got {self.model}")
+        if self.profile is not None and self.model != PROFILE_MODEL:
+            raise combination_error(f"`profile` has an effect only with `model` {PROFILE_MODEL}; got {self.model}")
         return self
 
     @property
@@ -468,10 +474,10 @@ class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, Posterior
 
     @property
     def options(self) -> dict[str, float]:
-        """Every option of the fidelity. A run is short where its length is not stated."""
+        """Every option of the fidelity. The default duration is at most `SHORT_RUN`."""
         options = super().options
         if self.duration_s is None and "duration" in options:
-            options["duration"] = min(options["duration"], SHOWN)
+            options["duration"] = min(options["duration"], SHORT_RUN)
         return options
 
 
@@ -486,7 +492,7 @@ class Compare(RobotPart, DataPart, FidelityPart, PosteriorPart, OutputPart):
 
 
 class Render(RobotPart, FidelityPart, SupplyPart):
-    """One run of the fidelity that pictures are made from."""
+    """One run, for a picture."""
 
     model: Literal["track"] = "track"
 
@@ -498,19 +504,19 @@ class ConfigurationPart(Part):
 
 
 class Resonance(RobotPart, ConfigurationPart, FidelityPart, OutputPart):
-    """A map of ripple over speed and payload, of the fidelity that resolves the running gear."""
+    """A map of ripple over speed and payload, from the fidelity that resolves the running gear."""
 
     model: Literal["track"] = "track"
     duration_s: Duration | None = option_field(
         None, "Length of a run (s), whose second half is evaluated", usual="1.5", minimum=0.5
     )
-    voltages_V: Several[Voltage] = option_field(
+    voltages_V: NonEmpty[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
         "Supply voltages (V), at least 5",
         usual="10:40:1, that is 31",
         minimum=0,
     )
-    payloads_kg: Several[Payload] = option_field(PAYLOADS_KG, "Additional load masses")
+    payloads_kg: NonEmpty[Payload] = option_field(PAYLOADS_KG, "Additional load masses")
     slope_deg: Slope = option_field(0.0, "Slope, positive uphill")
     surface: PaperSurface = option_field(BENCH, "Surface of Table 5")  # type: ignore[valid-type]
 
@@ -536,7 +542,7 @@ class ClimbPart(Part):
 
 
 class Climb(RobotPart, ConfigurationPart, ClimbPart, SupplyPart, OutputPart):
-    """One robot over an obstacle, or the largest that it gets over."""
+    """One robot over an obstacle, or a search for the largest obstacle that it can climb."""
 
     step_mm: Height | None = option_field(None, "Height of a step")
     stairs: str | None = option_field(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
@@ -588,7 +594,7 @@ class Reproduce(RobotPart, ModelPart):
 
 
 class FeedforwardPart(Part):
-    """Constants kS, kV, kA in the place of a robot's parameters."""
+    """Fit of the constants kS, kV, kA instead of a robot's parameters."""
 
     feedforward: Literal["simple", "elevator", "arm"] | None = option_field(
         None,
@@ -608,7 +614,7 @@ class FeedforwardPart(Part):
 
 
 class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart):
-    """Options of a calibration. For None the fidelity or the data decide."""
+    """Options of a calibration. None: the default depends on the fidelity or the data."""
 
     model: Annotated[str, AfterValidator(_check_fidelity)] | None = option_field(
         None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
@@ -710,8 +716,10 @@ class Size(RequirementsPart, RobotPart, OutputPart):
 
 
 class Sensitivity(RobotPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
-    """A sensitivity study. Methods that draw a sample take the ends of axes that are not stated, and of
-    slopes also the middle."""
+    """A sensitivity study.
+
+    Methods that draw a sample use only the ends of axes that are not stated, and for slopes also the middle.
+    """
 
     method: str = option_field(
         "sobol",
@@ -736,7 +744,7 @@ class Sensitivity(RobotPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
     @model_validator(mode="before")
     @classmethod
     def _of_a_posterior(cls, values: Any) -> Any:
-        """Its inputs are correlated, and the methods that sample need independent ones."""
+        """Makes `local` the default with a posterior, because the other methods need independent inputs."""
         if isinstance(values, dict) and values.get("posterior") and values.get("method") is None:
             return {**values, "method": "local"}
         return values
@@ -758,14 +766,15 @@ def resolve_configuration(kind: type[C], file: Path | None, options: Json, trust
     """The configuration of a command: defaults, then the file's keys, then the options given (not None).
 
     Args:
-        trust: true if the file may state code to execute, otherwise only options may.
+        trust: True if the file may name code to run. Otherwise only options may.
 
     Raises:
-        BadConfiguration: unreadable file, unknown key, a value out of range, or what a file may not state.
+        BadConfiguration: the file cannot be read or names code to run without `trust`, a key is unknown, or a value
+            is out of range.
     """
     values = {} if file is None else read_toml(file)
     option_values = {k: v for k, v in options.items() if v is not None}
-    for name in (name for name, facts in schema_facts(kind).items() if facts.get("executes")):
+    for name in (name for name, schema in schema_facts(kind).items() if schema.get("executes")):
         if file is not None and values.get(name) and name not in option_values and not trust:
             option = options_of_fields(kind)[name]
             raise BadConfiguration(
@@ -774,7 +783,7 @@ def resolve_configuration(kind: type[C], file: Path | None, options: Json, trust
             )
     if "set" in option_values:
         set_values = values.get("set", {})
-        # A file whose table is none is refused below, whatever the options say.
+        # If the file's `set` is not a table, the validation below rejects it regardless of the options.
         option_values["set"] = {**set_values, **option_values["set"]} if isinstance(set_values, dict) else set_values
     try:
         return kind.model_validate({**values, **option_values})
@@ -782,34 +791,37 @@ def resolve_configuration(kind: type[C], file: Path | None, options: Json, trust
         raise BadConfiguration(_error_sentence(kind, error, file, option_values)) from None
 
 
-def _error_sentence(kind: type[Part], error: ValidationError, file: Path | None, given: Json) -> str:
-    first, options = error.errors()[0], options_of_fields(kind)
+def _error_sentence(kind: type[Part], error: ValidationError, file: Path | None, option_values: Json) -> str:
+    first_error = error.errors()[0]
+    options = options_of_fields(kind)
 
-    def called(name: str) -> str:
+    def displayed_name(name: str) -> str:
         """Name of a field for messages: its option, or its key in the file that contains it."""
-        return options.get(name, name) if file is None or name in given else name
+        return options.get(name, name) if file is None or name in option_values else name
 
-    if first["type"] == "idle":  # whose message has fields between backticks
-        message = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
+    if first_error["type"] == "idle":  # its message has names of fields between backticks
+        message = re.sub(r"`(\w+)`", lambda match: displayed_name(match[1]), first_error["msg"])
         return message if file is None else f"{file.name}: {message}"
-    key = str(first["loc"][0])
-    key_path = ".".join(str(part) for part in first["loc"])
-    option_place = f"{file.name}, {key_path}" if file is not None and key not in given else called(key)
-    if first["type"] == "extra_forbidden":
+    key = str(first_error["loc"][0])
+    key_path = ".".join(str(part) for part in first_error["loc"])
+    option_place = (
+        f"{file.name}, {key_path}" if file is not None and key not in option_values else displayed_name(key)
+    )
+    if first_error["type"] == "extra_forbidden":
         return f"{option_place}: no such key; {allowed_words(key, kind.model_fields)}"
-    expectation = first["msg"][0].lower() + first["msg"][1:]
-    fact = schema_facts(kind).get(key, {})
-    limits = {**fact.get("items", {}), **fact}
-    if first["type"] == "literal_error":
-        expectation = f"expected {first['ctx']['expected']}"
-    if {"minimum", "maximum"} <= limits.keys() and {"ge", "le"} & first.get("ctx", {}).keys():
+    expectation = first_error["msg"][0].lower() + first_error["msg"][1:]
+    schema = schema_facts(kind).get(key, {})
+    limits = {**schema.get("items", {}), **schema}
+    if first_error["type"] == "literal_error":
+        expectation = f"expected {first_error['ctx']['expected']}"
+    if {"minimum", "maximum"} <= limits.keys() and {"ge", "le"} & first_error.get("ctx", {}).keys():
         expectation = f"expected {limits['minimum']:.10g} to {limits['maximum']:.10g}"
-    return f"{option_place}: got {first['input']!r}; {expectation}"
+    return f"{option_place}: got {first_error['input']!r}; {expectation}"
 
 
 def as_toml(config: Part) -> str:
     """The resolved configuration, which `--config` accepts."""
-    from calibration.data.writing import toml_value  # with NumPy, which --help does not wait for
+    from calibration.data.writing import toml_value  # imports NumPy, which --help does not need
 
     lines = []
     values = config.model_dump()

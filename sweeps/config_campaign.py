@@ -29,7 +29,7 @@ from sweeps.options import options_of_fields
 
 #: Keys that only a sweep into a store has.
 KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile", "obstacle")
-#: Options of a grid, which a file with axes of its own has no use for.
+#: Options of a grid, which have no effect with a file that has its own axes.
 GRID = (
     "configurations", "voltages_V", "motor_speeds_rpm", "payloads_kg", "slopes_deg", "load_torques_Nm", "surface",
     "battery",
@@ -37,13 +37,15 @@ GRID = (
 )  # fmt: skip
 
 
-#: Axis of the size of what is climbed.
+#: Axis of the size of the obstacle.
 SIZE = "obstacle_mm"
 
 
 class Obstacle(ClimbPart):
-    """Obstacle that every point of a sweep climbs (`sweeps.points.tasks`). Its size is the axis `obstacle_mm`, or
-    found by a search."""
+    """Obstacle that every point of a sweep climbs (`sweeps.points.tasks`).
+
+    Its size is the axis `obstacle_mm`, or a search finds the largest one.
+    """
 
     kind: Literal["step", "stairs", "gap"]
     find: bool = False
@@ -65,8 +67,8 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
         conditions: constant conditions, by name.
         axes: axes of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
         samples: a sampled design: design, number, seed, over (distributions by name), posterior.
-        outputs: names of `mmrjax.fidelities.outputs.output_table()`, of columns of the fidelity, or flags; empty: the
-            channels. With a profile: columns of `missions.mission_batch.OUTPUTS`, or flags; empty: its `USUAL`.
+        outputs: names of `mmrjax.fidelities.outputs.output_table()`, columns of the fidelity, or flags. Default: the
+            channels. With a profile: columns of `missions.mission_batch.OUTPUTS`, or flags. Default: its `USUAL`.
         storage: type in which outputs are stored.
         compression: compression of the store's chunks.
         obstacle: obstacle that every point climbs, in place of a run of the fidelity.
@@ -117,12 +119,13 @@ class StoreOptions(FolderPart):
 
 
 def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> Campaign | Sweep:
-    """The configuration of a sweep into a store: of its file, or the grid of the options (or of such a file).
+    """Configuration of a sweep: a campaign if the file has its own axes, otherwise a grid.
 
-    A grid is one of a store's once the robot is known (`campaign_of_grid`).
+    `campaign_of_grid` turns a grid into a campaign once the robot is known.
 
     Raises:
-        BadConfiguration: for the same reasons as `resolve`. An option of the grid with a file that has its own axes.
+        BadConfiguration: for the same reasons as `resolve_configuration`, or an option of the grid is combined with a
+            file that has its own axes.
     """
     if file is not None and not set(KEYS).isdisjoint(read_toml(file)):
         for name in GRID:
@@ -137,20 +140,20 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
 
 def campaign_of_grid(grid: Sweep) -> Campaign:
     """Campaign whose axes are the stated axes of a grid, in the units of `variation`."""
-    speeds = grid.motor_speeds_rpm
+    motor_speeds = grid.motor_speeds_rpm
     axes: dict[str, tuple[float, ...] | None] = {
         "voltage": None if grid.battery else grid.voltages_V,
-        "motor_speed": None if speeds is None else tuple(n * RPM for n in speeds),
+        "motor_speed": None if motor_speeds is None else tuple(n * RPM for n in motor_speeds),
         "payload": grid.payloads_kg,
         "load_torque": grid.load_torques_Nm,
         "slope_deg": grid.slopes_deg,
     }
-    # every run of the grid with every robot drawn, which the store keeps along its last dimension
-    sampled = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
+    # Each run of the grid is combined with each drawn robot, along the last dimension of the store.
+    posterior_samples = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
     names = "all" if grid.configurations is None else list(grid.configurations)
     return Campaign(
         **{key: getattr(grid, key) for key in Sweep.model_fields if key in Campaign.model_fields},
-        samples=sampled if grid.posterior is not None else {},
+        samples=posterior_samples if grid.posterior is not None else {},
         axes={"configuration": names, **{name: list(values) for name, values in axes.items() if values is not None}},
         conditions={
             **({} if grid.surface is None else {"surface": grid.surface}),

@@ -33,7 +33,7 @@ from mmrjax.errors import printable
 #: Widest line of text on a terminal.
 COLUMNS = 80
 #: Longest silence of a long computation, and of a command that begins [s].
-SILENCE, FIRST = 2.0, 1.0
+SILENCE, FIRST_MESSAGE = 2.0, 1.0
 #: Name of the output of results in error messages.
 OUTPUT = "standard output"
 
@@ -115,74 +115,78 @@ def wrap_for_terminal(text: str) -> str:
 @contextmanager
 def report_working(name: str) -> Iterator[None]:
     """Reports that a command is working if imports and compilation take longer than usual."""
-    soon = threading.Timer(FIRST, print_message, [f"{name}: working"])
-    soon.daemon = True
-    soon.start()
+    timer = threading.Timer(FIRST_MESSAGE, print_message, [f"{name}: working"])
+    timer.daemon = True
+    timer.start()
     try:
         yield
     finally:
-        soon.cancel()
-        soon.join()
+        timer.cancel()
+        timer.join()
 
 
 @contextmanager
 def step_reporter(
-    tell: Callable[[str], None], doing: str, silence: float = SILENCE, again: Callable[[str], None] = rewrite_line
+    print_line: Callable[[str], None],
+    doing: str,
+    silence: float = SILENCE,
+    rewrite: Callable[[str], None] = rewrite_line,
 ) -> Iterator[Callable[[str], None]]:
     """Yields a function that prints the current step. After a silence, the step is printed again with its time and
     the number of programs compiled.
 
     Args:
-        tell: function that prints a line.
+        print_line: function that prints a line.
         doing: step before the first call.
         silence: longest time without output [s].
-        again: function that rewrites the progress line.
+        rewrite: function that rewrites the progress line.
     """
     import jax
 
     from calibration.words.step_words import still_running_sentence
 
-    compiled, state = 0, [(doing, time.monotonic(), 0)]
-    spoke, is_over = threading.Event(), threading.Event()
+    compiled = 0
+    current_step = [(doing, time.monotonic(), 0)]
+    step_reported, stopped = threading.Event(), threading.Event()
 
     def count(event: str, duration_secs: float, **_: Any) -> None:
         nonlocal compiled
         compiled += event.endswith("backend_compile_duration")
 
-    def say_it(text: str) -> None:
-        state[:] = [(text, time.monotonic(), compiled)]
-        spoke.set()
-        tell(text)
+    def report_step(text: str) -> None:
+        current_step[:] = [(text, time.monotonic(), compiled)]
+        step_reported.set()
+        print_line(text)
 
-    def beat() -> None:
-        while not is_over.is_set():
-            heard = spoke.wait(silence)
-            spoke.clear()
-            if not heard and not is_over.is_set():
-                text, since, before = state[0]
-                again(still_running_sentence(text, time.monotonic() - since, compiled - before))
+    def repeat_steps() -> None:
+        while not stopped.is_set():
+            is_reported = step_reported.wait(silence)
+            step_reported.clear()
+            if not is_reported and not stopped.is_set():
+                text, started, compiled_before = current_step[0]
+                rewrite(still_running_sentence(text, time.monotonic() - started, compiled - compiled_before))
 
     jax.monitoring.register_event_duration_secs_listener(count)
-    thread = threading.Thread(target=beat, daemon=True)
+    thread = threading.Thread(target=repeat_steps, daemon=True)
     thread.start()
     try:
-        yield say_it
+        yield report_step
     finally:
-        is_over.set()
-        spoke.set()
+        stopped.set()
+        step_reported.set()
         thread.join()
 
 
 @contextmanager
-def report_stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator[None]:
-    """Reports a stage of a command and its elapsed time. `silent`: without the time, next to a progress bar."""
+def report_stage(number: int, total: int, doing: str, without_time: bool = False) -> Iterator[None]:
+    """Reports a stage of a command and its elapsed time. `without_time`: without the time, next to a progress bar."""
     text = f"{number} of {total}, {doing}"
-    if silent:
+    if without_time:
         print_message(text)
         yield
         return
-    with step_reporter(print_message, doing) as heard:
-        heard(text)
+    with step_reporter(print_message, doing) as report_step:
+        report_step(text)
         yield
 
 

@@ -45,27 +45,28 @@ def load_robot(config: RobotPart) -> RobotFile:
             f"--robot {file.name}: its controller follows a goal; use calibrate, compare, loop or rig check with "
             "a log, export, or mmrjax.simulate in Python"
         )
-    unlike: Names = ()
+    unlike_notes: Names = ()
     if robot.unlike and robot.has_ground and not getattr(config, "turns", False):
-        unlike = (turn_words.unlike_sides_note(file.name, robot),)
+        unlike_notes = (turn_words.unlike_sides_note(file.name, robot),)
     examples = list_some(stated.example_numbers(file.text))
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
         notes.append(
             f"{file.name}: still example numbers of the template: {examples}. The fit widens each ± among them to "
             f"± {100 * stated.EXAMPLE_SHARE:g} %"
         )
-    for note in (*notes, *unlike):
+    for note in (*notes, *unlike_notes):
         print_message(note)
-    resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
-    runs = robot.has_ground and robot.rig.imposed == "voltage"
-    runs = runs and all(c.inertia > 0 for _, c in robot.configurations.items())  # otherwise the model rejects it
-    if resolves and runs and not capabilities.states_running_gear(robot):
+    resolves_gear = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
+    # the model rejects other robots
+    is_accepted = robot.has_ground and robot.rig.imposed == "voltage"
+    is_accepted = is_accepted and all(c.inertia > 0 for _, c in robot.configurations.items())
+    if resolves_gear and is_accepted and not capabilities.states_running_gear(robot):
         print_message("the robot's file has no running_gear: its wheelbase, belt and masses are examples")
-    return dataclasses.replace(file, robot=robot, stated=file.stated | {*config.set}, remarks=unlike)
+    return dataclasses.replace(file, robot=robot, stated=file.stated | {*config.set}, remarks=unlike_notes)
 
 
 def posterior_beside_robot(file: RobotFile) -> Posterior:
-    """Posterior from the folder of a calibrated robot file.
+    """Posterior from the folder of a robot file that `calibrate` or `loop` wrote.
 
     Raises:
         BadConfiguration: the robot is not from a file.
@@ -134,18 +135,20 @@ def read_runs(
     return runs
 
 
-def given_runs(robot: Robot, beside: GivenRuns, config: Simulate, elsewhere: Collection[str] = ()) -> records.Runs:
-    """Runs from a file, or one run from options. `elsewhere`: columns that a profile states."""
-    if beside.runs is None:
-        return one_run(robot, beside.stated, config.battery, elsewhere)
-    return read_runs(str(beside.runs), robot, columns=config.columns, measured=False, battery=config.battery)
+def given_runs(
+    robot: Robot, invocation: GivenRuns, config: Simulate, profile_columns: Collection[str] = ()
+) -> records.Runs:
+    """Runs from a file, or one run from options. `profile_columns`: columns that a profile states."""
+    if invocation.runs is None:
+        return one_run(robot, invocation.stated, config.battery, profile_columns)
+    return read_runs(str(invocation.runs), robot, columns=config.columns, measured=False, battery=config.battery)
 
 
-def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collection[str] = ()) -> records.Runs:
+def one_run(robot: Robot, cells: Json, battery: bool = False, profile_columns: Collection[str] = ()) -> records.Runs:
     """One run from options by column name, of the robot's first configuration unless stated.
 
     Args:
-        elsewhere: columns that a profile states.
+        profile_columns: columns that a profile states.
 
     Raises:
         BadConfiguration: a value is out of range, the configuration is unknown, or a voltage is combined with the
@@ -162,28 +165,28 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
     check_configurations(robot, (name,), "--configuration")
     layout = Layout.of(robot)
     column = layout.imposed_column
-    for other, _ in IMPOSED.values():
-        if other != column and other in cell_values:
-            raise BadConfiguration(capabilities.option_refusal(robot, OPTIONS[other], OPTIONS[column]))
-    idle = [OPTIONS[key] for key in cell_values if key in layout.idle]
-    capabilities.check_acting(robot, idle, idle)
+    for other_column, _ in IMPOSED.values():
+        if other_column != column and other_column in cell_values:
+            raise BadConfiguration(capabilities.option_refusal(robot, OPTIONS[other_column], OPTIONS[column]))
+    inapplicable = [OPTIONS[key] for key in cell_values if key in layout.idle]
+    capabilities.check_acting(robot, inapplicable, inapplicable)
     if battery:
         capabilities.check_battery(robot)
-    elif column in elsewhere:
+    elif column in profile_columns:
         cell_values.setdefault(column, 0.0)
     elif column not in cell_values:
         cell_values[column] = capabilities.imposed_default(robot, OPTIONS[column])
     if robot.has_ground:
-        bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
-        cell_values = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}
+        default_surface = {"surface": BENCH} if robot.rig.scales_adhesion else {}
+        cell_values = {**default_surface, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}
         surface = cell_values.get("surface", BENCH)
-        is_known = surface in SURFACES or not robot.rig.scales_adhesion
-        if not is_known and table.configuration_on_surface(name, surface) not in robot.configurations:
+        has_friction = surface in SURFACES or not robot.rig.scales_adhesion
+        if not has_friction and table.configuration_on_surface(name, surface) not in robot.configurations:
             raise BadConfiguration(
                 f"--surface: got {surface}, for which no friction is known; {allowed_words(surface, SURFACES)}"
             )
     run = records.single_run({**cell_values, "configuration": name}, layout)
-    if misplaced := misplaced_levers(run, robot):
-        _, column, why = misplaced
-        raise BadConfiguration(f"{OPTIONS[column]}: {why}")
+    if misplaced_lever := misplaced_levers(run, robot):
+        _, column, reason = misplaced_lever
+        raise BadConfiguration(f"{OPTIONS[column]}: {reason}")
     return run

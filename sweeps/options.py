@@ -30,14 +30,17 @@ UNITS = {
 }
 
 
-def schema_facts(kind: type[BaseModel]) -> dict[str, Json]:
+def schema_facts(config_kind: type[BaseModel]) -> dict[str, Json]:
     """Schema of each field of a configuration: its own fields, then those of its parts."""
-    schema = kind.model_json_schema()["properties"]
-    own_metadata = [
-        name for part in kind.__mro__ if issubclass(part, BaseModel) for name in vars(part).get("__annotations__", {})
+    schema = config_kind.model_json_schema()["properties"]
+    field_names = [
+        name
+        for part in config_kind.__mro__
+        if issubclass(part, BaseModel)
+        for name in vars(part).get("__annotations__", {})
     ]
     facts = {}
-    for name in dict.fromkeys(n for n in own_metadata if n in schema):
+    for name in dict.fromkeys(n for n in field_names if n in schema):
         option_schema = schema[name]
         value_schema: Json = next((a for a in option_schema.get("anyOf", ()) if a.get("type") != "null"), {})
         facts[name] = {**value_schema, **option_schema}
@@ -57,9 +60,9 @@ def split_unit(name: str) -> tuple[str, str]:
     )
 
 
-def options_of_fields(kind: type[BaseModel]) -> dict[str, str]:
+def options_of_fields(config_kind: type[BaseModel]) -> dict[str, str]:
     """The option of each field."""
-    return {name: option_of_field(name, fact) for name, fact in schema_facts(kind).items()}
+    return {name: option_of_field(name, fact) for name, fact in schema_facts(config_kind).items()}
 
 
 _TYPES = {"boolean": bool, "integer": int, "number": float, "string": str, "object": list[str]}
@@ -99,27 +102,29 @@ def _default_text(name: str, fact: Json) -> str:
     )
 
 
-def option_parameters(kinds: Iterable[type[BaseModel]], common: Sequence[str]) -> Iterator[inspect.Parameter]:
+def option_parameters(config_kinds: Iterable[type[BaseModel]], common: Sequence[str]) -> Iterator[inspect.Parameter]:
     """A function parameter for each field of a command that can be chosen, with default None.
 
     The `common` options come first. `--help` hides the others.
     """
-    facts = {name: fact for kind in kinds for name, fact in schema_facts(kind).items() if "const" not in fact}
+    facts = {name: fact for kind in config_kinds for name, fact in schema_facts(kind).items() if "const" not in fact}
     words = {name: option_of_field(name, fact).removeprefix("--") for name, fact in facts.items()}
-    order = {word: place for place, word in enumerate(common)}
-    for name in sorted(facts, key=lambda name: order.get(words[name], len(order))):
+    position = {word: place for place, word in enumerate(common)}
+    for name in sorted(facts, key=lambda name: position.get(words[name], len(position))):
         fact, word = facts[name], words[name]
-        default, annotation = None, _option_type(fact) | None
+        default = None
+        annotation = _option_type(fact) | None
         if fact.get("argument"):
-            declared: Any = typer.Argument(metavar=fact.get("metavar"), help=option_help(name, fact))
+            declaration: Any = typer.Argument(metavar=fact.get("metavar"), help=option_help(name, fact))
             if "default" not in fact:
-                default, annotation = inspect.Parameter.empty, _option_type(fact)
+                default = inspect.Parameter.empty
+                annotation = _option_type(fact)
         else:
-            pair = fact.get("type") == "boolean" and fact.get("default") is not False
-            names = f"--{word}/--no-{word}" if pair else f"--{word}"
-            declared = typer.Option(names, help=option_help(name, fact), hidden=word not in order)
+            has_negation = fact.get("type") == "boolean" and fact.get("default") is not False
+            names = f"--{word}/--no-{word}" if has_negation else f"--{word}"
+            declaration = typer.Option(names, help=option_help(name, fact), hidden=word not in position)
         keyword = inspect.Parameter.KEYWORD_ONLY
-        yield inspect.Parameter(name, keyword, default=default, annotation=Annotated[annotation, declared])
+        yield inspect.Parameter(name, keyword, default=default, annotation=Annotated[annotation, declaration])
 
 
 def _option_type(fact: Json) -> Any:
@@ -128,13 +133,16 @@ def _option_type(fact: Json) -> Any:
     return _LISTS[fact["items"]["type"]] if fact["type"] == "array" else _TYPES[fact["type"]]
 
 
-def take_options(kind: type[BaseModel], values: Json) -> Json:
+def take_options(config_kind: type[BaseModel], values: Json) -> Json:
     """Removes the options of a configuration from a command's values and parses them.
 
     Raises:
         BadConfiguration: an axis or a change cannot be parsed.
     """
-    return {name: _parse_option(name, fact, values.pop(name, None)) for name, fact in schema_facts(kind).items()}
+    return {
+        name: _parse_option(name, schema, values.pop(name, None))
+        for name, schema in schema_facts(config_kind).items()
+    }
 
 
 def _parse_option(name: str, fact: Json, value: Any) -> Any:
@@ -161,13 +169,13 @@ def help_all() -> inspect.Parameter:
     )
 
 
-def _show_full_help(context: typer.Context, wanted: bool) -> None:
-    if wanted:
-        shown_context = copy.copy(context.command)
-        shown_context.params = [copy.copy(p) for p in shown_context.params]
-        for p in shown_context.params:
+def _show_full_help(context: typer.Context, is_wanted: bool) -> None:
+    if is_wanted:
+        command = copy.copy(context.command)
+        command.params = [copy.copy(p) for p in command.params]
+        for p in command.params:
             p.hidden = False  # type: ignore[attr-defined]  # of an option
-        typer.echo(shown_context.get_help(context))
+        typer.echo(command.get_help(context))
         raise typer.Exit
 
 

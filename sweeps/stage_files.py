@@ -2,7 +2,7 @@
 
 Each file is a pickle after its checksum. Reading runs no code from the file. A pickle may name only dataclasses and
 named tuples of `mmrjax` and `calibration`, effects that the user has loaded, and a few functions. These functions are
-in `REBUILDING`, `ARRAYS` and `FUNCTIONS`.
+in `REBUILDERS`, `ARRAYS` and `FUNCTIONS`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mmrjax.model.channels import Channel
 #: Packages whose classes a file may name, and the module whose functions it may name.
 PACKAGES, FUNCTIONS = ("mmrjax", "calibration"), "calibration.discovery.menu"
 #: Functions that rebuild objects from their parts.
-REBUILDING = (channels.find_channel, scaled_effect, restore_effect)
+REBUILDERS = (channels.find_channel, scaled_effect, restore_effect)
 #: Classes and functions that rebuild arrays and numbers of NumPy, and the function for arrays of JAX, by its name.
 ARRAYS = (
     np.ndarray, np.dtype, np.zeros(1).__reduce__()[0], np.zeros(1).__reduce_ex__(5)[0], np.float64(0).__reduce__()[0],
@@ -46,7 +46,7 @@ def write_stage(file: Path, value: Any) -> None:
     """Writes a value.
 
     Raises:
-        Unwritable: a part of it is no value, no array, and no instance of our dataclasses.
+        Unwritable: a part of it is no plain value, no array, and no instance of our dataclasses.
         OSError: the file cannot be written.
     """
     content = io.BytesIO()
@@ -93,7 +93,7 @@ class _Writer(pickle.Pickler):
 
 
 class _Reader(pickle.Unpickler):
-    """Reads what `_Writer` wrote."""
+    """Unpickles values written by `_Writer`."""
 
     def find_class(self, module: str, name: str) -> Any:
         _check_module(module)  # before it is imported
@@ -104,9 +104,9 @@ class _Reader(pickle.Unpickler):
 
 def _check_module(module: str) -> None:
     """Raises `pickle.PickleError` for a module that a file may not name."""
-    is_users = module.startswith(OWN_MODULE) and module in sys.modules
-    is_of_arrays = module == JAX_ARRAY[0] or module in [x.__module__ for x in ARRAYS]
-    if module.partition(".")[0] not in PACKAGES and not is_users and not is_of_arrays:
+    is_user_module = module.startswith(OWN_MODULE) and module in sys.modules
+    is_array_module = module == JAX_ARRAY[0] or module in [x.__module__ for x in ARRAYS]
+    if module.partition(".")[0] not in PACKAGES and not is_user_module and not is_array_module:
         raise pickle.PickleError(f"a class of {module}")
 
 
@@ -116,6 +116,6 @@ def _check_named(target: Any, module: str) -> None:
     if target in ARRAYS or (module, name) == JAX_ARRAY:
         return
     is_record = isinstance(target, type) and (dataclasses.is_dataclass(target) or issubclass(target, tuple))
-    is_function = isinstance(target, types.FunctionType) and (target in REBUILDING or module == FUNCTIONS)
+    is_function = isinstance(target, types.FunctionType) and (target in REBUILDERS or module == FUNCTIONS)
     if target.__module__ != module or not (is_record or is_function):
         raise pickle.PickleError(f"{module}.{name}")

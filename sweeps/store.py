@@ -57,7 +57,8 @@ def finish_run_folder(folder: Folder, manifest: Json, page: Page, solved: bool =
     Returns:
         Exit code: 0, or 3 if a solver failed.
     """
-    results, config = folder.results(), folder.config
+    results = folder.results()
+    config = folder.config
     if not (results / "robot.toml").exists():
         note = f"the robot of this run, from {config.robot}"
         robot_file.write_robot(folder.robot, results / "robot.toml", note=note)
@@ -78,17 +79,17 @@ LOCK, CHUNKS = "lock", "chunks"
 #: Zarr group of a sweep, journal of its chunks, and temporary folder for its files.
 STORE, JOURNAL, IDENTITY, ASIDE = "results.zarr", "journal", "identity.json", "writing"
 #: Names in an unfinished folder, before the results are written.
-PARTS = frozenset((LOCK, CHUNKS, REFIT_FILE, STORE, JOURNAL, IDENTITY, ASIDE))
+UNFINISHED_NAMES = frozenset((LOCK, CHUNKS, REFIT_FILE, STORE, JOURNAL, IDENTITY, ASIDE))
 #: Ending of the files in `CHUNKS`.
-ENDING = ".stage"
+STAGE_SUFFIX = ".stage"
 #: File with the loop's ranking by regression, before any confirmation.
 SCREENING_FILE = "screening.json"
 #: Key of the lock file with the names of foreign files.
 FOREIGN = "foreign"
 #: Commands that fit a robot.
-FITS = (["calibrate"], ["loop"])
+FITTING_COMMANDS = (["calibrate"], ["loop"])
 #: Largest manifest or mark that is read [bytes].
-LARGEST = 2**20
+LARGEST_FILE = 2**20
 #: Packages whose versions are part of a result.
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "lineax", "diffrax", "numpy")
 
@@ -107,7 +108,7 @@ class Folder:
     #: Folder for files that a finished command does not need.
     scratch: str
     #: Names that a finished folder may contain besides those of the manifest.
-    further: Names = ()
+    extra_names: Names = ()
 
     def __init__(self, path: Path, force: bool) -> None:
         """Folder that will appear at `path`. `force`: True to replace a run folder there.
@@ -117,20 +118,23 @@ class Folder:
         """
         if not path.name:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
-        self.path, self.partial = path, path.with_name(path.name + ".partial")
+        self.path = path
+        self.partial = path.with_name(path.name + ".partial")
         self.tables = "csv"
-        self._results_begun, self._digest, self._force = False, "", force
+        self._results_begun = False
+        self._digest = ""
+        self._force = force
         self._lock: TextIO | None = None
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
-        """Rejects a path that already exists.
+        """Rejects a final path that already exists.
 
         Args:
             force: True to replace a run folder that contains only files of its command.
 
         Raises:
-            BadConfiguration: it does.
+            BadConfiguration: the path exists and may not be replaced.
         """
         if not os.path.lexists(self.path) or (self.path.is_dir() and not any(self.path.iterdir())):
             return
@@ -141,8 +145,8 @@ class Folder:
         elif (file_names := listed_names(self.path)) is None:
             hint = "--force replaces only run folders"
         else:
-            left_by_kill = (LOCK, self.scratch)  # of a process that was moving the folder
-            foreign = sorted({p.name for p in self.path.iterdir()} - {*file_names, *left_by_kill, *self.further})
+            leftovers = (LOCK, self.scratch)  # of a process that was moving the folder
+            foreign = sorted({p.name for p in self.path.iterdir()} - {*file_names, *leftovers, *self.extra_names})
             if not foreign:
                 return
             hint = f"--force would delete {foreign[0]}, which its command did not write"
@@ -154,10 +158,10 @@ class Folder:
 
         Args:
             command: command that will continue there.
-            force: True to start again in place of another command.
+            force: True to discard interrupted work of another command.
 
         Raises:
-            BadConfiguration: it does.
+            BadConfiguration: the folder may not be used.
         """
         if not os.path.lexists(self.partial) or (self.partial.is_dir() and not any(self.partial.iterdir())):
             return
@@ -177,13 +181,13 @@ class Folder:
 
     def _busy(self, share: str = "") -> BadConfiguration:
         """Error on another process that uses the folder."""
-        of_share = f", share {share.replace('-', ' ')}" * bool(share)
+        share_text = f", share {share.replace('-', ' ')}" * bool(share)
         return BadConfiguration(
-            f"--out: another process is using {self.partial}{of_share}; wait for it, or choose another path"
+            f"--out: another process is using {self.partial}{share_text}; wait for it, or choose another path"
         )
 
     def _present(self) -> bool:
-        """True if the folder is still the one that this process opened, neither removed nor moved."""
+        """True if nobody has removed or moved the folder that this process opened."""
         assert self._lock is not None
         try:
             return os.path.samestat(os.fstat(self._lock.fileno()), (self.partial / LOCK).stat())
@@ -193,13 +197,13 @@ class Folder:
     def _foreign(self) -> set[str]:
         """Names of foreign files in the partial folder.
 
-        Before results are written, these are all names except `PARTS`. Later the lock file lists them.
+        Before results are written, these are all names except `UNFINISHED_NAMES`. Later the lock file lists them.
         """
-        foreign = {p.name for p in self.partial.iterdir()} - PARTS
-        foreign_names = _json(self.partial / LOCK).get(FOREIGN)
+        foreign = {p.name for p in self.partial.iterdir()} - UNFINISHED_NAMES
+        foreign_names = _read_json(self.partial / LOCK).get(FOREIGN)
         chunk_files = (self.partial / CHUNKS).glob("*")
         return (foreign & set(map(str, foreign_names)) if isinstance(foreign_names, list) else foreign) | {
-            f"{CHUNKS}/{p.name}" for p in chunk_files if p.suffix != ENDING
+            f"{CHUNKS}/{p.name}" for p in chunk_files if p.suffix != STAGE_SUFFIX
         }
 
     def _clear(self) -> None:
@@ -219,7 +223,8 @@ class Folder:
 
     def results(self) -> Path:
         """Folder for the results, which is moved into place when all are written."""
-        mark, lock = _json(self.partial / LOCK), self.partial / LOCK
+        mark = _read_json(self.partial / LOCK)
+        lock = self.partial / LOCK
         if not self._results_begun and FOREIGN not in mark:
             # Foreign files are listed before the first result is written. All other files are then ours.
             text = json.dumps({**mark, FOREIGN: sorted(self._foreign())})
@@ -298,7 +303,7 @@ class Folder:
         return self.path
 
     def _tidy(self) -> None:
-        """Deletes what a finished folder does not need. The lock is last: while it exists, something may be left."""
+        """Deletes temporary files of a finished folder, the lock last. While it exists, others may be left."""
         if (self.path / LOCK).is_file():
             shutil.rmtree(self.path / self.scratch, ignore_errors=True)
             (self.path / LOCK).unlink(missing_ok=True)
@@ -313,7 +318,7 @@ class Folder:
 
 def listed_names(folder: Path) -> list[str] | None:
     """Names in the manifest of a run folder. None if it is not one of ours."""
-    manifest = _json(folder / "manifest.json")
+    manifest = _read_json(folder / "manifest.json")
     names = manifest.get("contents")
     if manifest.get("schema") != MANIFEST or not isinstance(names, list):
         return None
@@ -328,7 +333,7 @@ def interrupted_run(partial: Path) -> dict[str, str] | None:
     if partial.is_symlink() or not (partial / LOCK).is_file():
         return None
     for _ in range(2):  # another process may write it between the first check and the listing
-        mark = _json(partial / LOCK)
+        mark = _read_json(partial / LOCK)
         if mark.get("schema") == UNFINISHED and isinstance(mark.get("command"), str):
             return {"command": mark["command"], "identity": str(mark.get("identity", ""))}
         with contextlib.suppress(FileNotFoundError):
@@ -344,18 +349,18 @@ def lock_text(command: str, identity: str = "") -> str:
 
 def holds_work(partial: Path) -> bool:
     """True if a run that ended early stored anything: chunks, stages, journal lines, or a result."""
-    patterns = (f"{CHUNKS}/[!.]*{ENDING}", f"{JOURNAL}/*.jsonl", "manifest.json")
+    patterns = (f"{CHUNKS}/[!.]*{STAGE_SUFFIX}", f"{JOURNAL}/*.jsonl", "manifest.json")
     return any(file.stat().st_size for pattern in patterns for file in partial.glob(pattern))
 
 
-def share_at_work(partial: Path, own: Path | None = None) -> str | None:
+def share_at_work(partial: Path, caller_journal: Path | None = None) -> str | None:
     """Share of a sweep that another process is computing. None if there is none.
 
     Args:
-        own: journal of this process.
+        caller_journal: journal of this process.
     """
     for file in sorted((partial / JOURNAL).glob("*.jsonl")):
-        if file != own:
+        if file != caller_journal:
             with file.open("a") as journal:
                 if not try_to_lock(journal):
                     return file.stem
@@ -373,11 +378,11 @@ def try_to_lock(file: TextIO) -> bool:
     return True
 
 
-def _json(file: Path) -> Json:
+def _read_json(file: Path) -> Json:
     """Content of a small JSON file, empty if it cannot be read."""
     try:
         with file.open("rb") as stream:
-            content = json.loads(stream.read(LARGEST))
+            content = json.loads(stream.read(LARGEST_FILE))
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -406,15 +411,16 @@ class RunFolder(Folder):
                 command was interrupted there.
         """
         super().__init__(path, force)
-        self.command, self._digest = str(identity.get("command", "")), identity_digest(identity)
-        self._taken_up = False
+        self.command = str(identity.get("command", ""))
+        self._digest = identity_digest(identity)
+        self._continued = False
         self.refuse_taken(force)
         try:
             self.refuse_foreign(self.command, force)
             while not self._enter():
                 self.close()
                 self.refuse_foreign(self.command, force)
-            self._begin_or_take_up()
+            self._create_or_continue()
         except BadConfiguration:
             self.close()
             raise
@@ -432,7 +438,7 @@ class RunFolder(Folder):
             raise self._busy()
         return self._present()
 
-    def _begin_or_take_up(self) -> None:
+    def _create_or_continue(self) -> None:
         assert self._lock is not None
         try:
             self.refuse_taken(self._force)  # moved by a process that has finished meanwhile
@@ -441,9 +447,9 @@ class RunFolder(Folder):
                 self._remove()
             raise
         mark = interrupted_run(self.partial)
-        self._taken_up = mark is not None and mark["identity"] == self._digest
-        if not self._taken_up:
-            if holds_work(self.partial) or FOREIGN in _json(self.partial / LOCK):
+        self._continued = mark is not None and mark["identity"] == self._digest
+        if not self._continued:
+            if holds_work(self.partial) or FOREIGN in _read_json(self.partial / LOCK):
                 if not self._force:
                     raise BadConfiguration(
                         f"--out: {self.partial} contains interrupted work of another configuration; choose "
@@ -459,14 +465,14 @@ class RunFolder(Folder):
     def __enter__(self) -> RunFolder:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: Any) -> None:
-        """Removes the folder if the command ended before a chunk was done, or was rejected after starting again.
-        Otherwise stored chunks and stages are used later.
+    def __exit__(self, error_type: type[BaseException] | None, error: BaseException | None, *_: Any) -> None:
+        """Removes the folder if no chunk is finished, or if the input of a new run was rejected. Otherwise the same
+        command can continue from it.
         """
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(self.partial)
-        refused = kind is not None and issubclass(kind, InputError) and not self._taken_up
-        if kind is not None and (refused or not holds_work(self.partial)):
+        is_rejected = error_type is not None and issubclass(error_type, InputError) and not self._continued
+        if error_type is not None and (is_rejected or not holds_work(self.partial)):
             self._remove()
         self.close()
 
@@ -505,11 +511,11 @@ class RunFolder(Folder):
         return self._chunk_file(name).is_file()
 
     def _chunk_file(self, name: str) -> Path:
-        return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}{ENDING}"
+        return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}{STAGE_SUFFIX}"
 
 
 def open_folder(
-    command: str, config: RobotPart, robot: Robot, beside: FolderPart, runs: Runs | None = None
+    command: str, config: RobotPart, robot: Robot, invocation: FolderPart, runs: Runs | None = None
 ) -> RunFolder:
     """Run folder of a command. Its identity is the configuration and the program's source.
 
@@ -519,11 +525,11 @@ def open_folder(
         command: name of the command.
         config: configuration of the command.
         robot: robot of the configuration, with its changes.
-        beside: options for the path of the folder, and for replacing an existing one.
+        invocation: path of the folder, and True to replace an existing one.
         runs: input table, if any.
     """
     folder = RunFolder(
-        beside.out or default_path(command), run_identity(command, config, robot, runs), force=beside.force
+        invocation.out or default_path(command), run_identity(command, config, robot, runs), force=invocation.force
     )
     folder.tables = getattr(config, "table", folder.tables)
     folder.config, folder.robot, folder.runs = config, robot, runs
@@ -548,7 +554,7 @@ def run_identity(command: str, config: RobotPart, robot: Robot, runs: Runs | Non
 
 def is_finished(path: Path, identity: Json) -> bool:
     """True if the finished run folder at a path has this identity."""
-    return bool(_json(path / "manifest.json").get("identity") == identity_digest(identity))
+    return bool(_read_json(path / "manifest.json").get("identity") == identity_digest(identity))
 
 
 def identity_digest(identity: Json) -> str:
@@ -558,12 +564,14 @@ def identity_digest(identity: Json) -> str:
 
 def rows_of_fit(robot: Path) -> frozenset[str]:
     """Hashes of the tables that a robot was fitted to, from the manifest in its folder. May be empty."""
-    manifest = _json(robot.parent / "manifest.json") if robot.is_file() else {}
+    manifest = _read_json(robot.parent / "manifest.json") if robot.is_file() else {}
     hashes, arguments = manifest.get("hashes"), manifest.get("arguments")
-    if not isinstance(hashes, dict) or not isinstance(arguments, list) or arguments[:1] not in FITS:
+    if not isinstance(hashes, dict) or not isinstance(arguments, list) or arguments[:1] not in FITTING_COMMANDS:
         return frozenset()
-    fitted = robot.name != "robot.toml" or hashes.get("robot") == sha256_hex(robot.read_bytes())
-    return frozenset(str(value) for name, value in hashes.items() if name != "robot") if fitted else frozenset()
+    is_fitted_robot = robot.name != "robot.toml" or hashes.get("robot") == sha256_hex(robot.read_bytes())
+    return (
+        frozenset(str(value) for name, value in hashes.items() if name != "robot") if is_fitted_robot else frozenset()
+    )
 
 
 def sha256_hex(content: bytes) -> str:

@@ -165,8 +165,8 @@ def accepted(*_, **__):
 #: Computations that take long, in the place of which a command ends: what comes before them is attacked here.
 HEAVY = (
     "calibration.sizing.sheet.check_requirements", "sweeps.commands.missions.run_missions", "sweeps.commands.climb.climb_batch",
-    "sweeps.commands.loop.discover", "sweeps.commands.calibrate.run", "sweeps.commands.sensitivity.analyse_sensitivity",
-    "sweeps.commands.size.search", "mmrjax.undercarriage.rendering.render",
+    "sweeps.commands.loop.discover", "sweeps.commands.calibrate.fit_robot", "sweeps.commands.sensitivity.analyse_sensitivity",
+    "sweeps.commands.size.search_designs", "mmrjax.undercarriage.rendering.render",
 )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ import typer
 from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, options
 from sweeps.config import Sweep, as_toml, resolve_configuration
-from sweeps.points.scale import Compiled, share_counter
+from sweeps.points.scale import CompiledJob, share_counter
 from tests.commands import ends, read_json
 from tests.commands import rows as table
 from tests.pages import recorded
@@ -113,7 +113,7 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
 
 def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatch):
     arguments = "sweep --slopes 0:9:1 --voltages 24 --configurations 6T2A --no-report"
-    simulated, honest = [], Compiled.__call__
+    simulated, honest = [], CompiledJob.__call__
 
     def interrupted(compiled, values, *told):
         if len(simulated) == 3:
@@ -123,13 +123,13 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
         simulated.append(len(values))
         return honest(compiled, values, *told)
 
-    monkeypatch.setattr(Compiled, "__call__", interrupted)
+    monkeypatch.setattr(CompiledJob, "__call__", interrupted)
     ends(mmrjax(f"{arguments} --chunk 10 --out s"), "with --out continues after the last complete chunk", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
     kept = len(list((tmp_path / "s.partial/chunks").glob("*.stage")))
     assert 0 < kept <= 3
     simulated.clear()
-    monkeypatch.setattr(Compiled, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
+    monkeypatch.setattr(CompiledJob, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
     assert mmrjax(f"{arguments} --chunk 10 --out s")[0] == 0
     assert simulated == [fidelities.FEW] * (6 - kept)  # filled up, and none twice
     resumed = (tmp_path / "s/runs.csv").read_text()
@@ -140,7 +140,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
 
 def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeypatch):
     arguments = "sweep --slopes 0:9:1 --chunk 60 --no-report --out"
-    honest, calls = Compiled.__call__, []
+    honest, calls = CompiledJob.__call__, []
     kept = tmp_path / "s.partial/chunks/chunk-000000.stage"
 
     def interrupted(*call):
@@ -152,7 +152,7 @@ def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeyp
         return honest(*call)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Compiled, "__call__", interrupted)
+        patch.setattr(CompiledJob, "__call__", interrupted)
         assert mmrjax(arguments, "s")[0] == 130 and kept.exists()
     other = "--set", "motor.resistance=0.9"
     ends(mmrjax(arguments, "s", *other), "--force")
@@ -178,7 +178,7 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
 @pytest.mark.parametrize("arguments, flags", [
     ("sweep --config grid.toml", [SOUND_AT_LEVEL_0, "--xla_cpu_multi_thread_eigen=false"]),
     ("compare --model track", [SOUND_AT_LEVEL_0, "--xla_cpu_multi_thread_eigen=false"]),
-    ("sweep", [SOUND_AT_LEVEL_0]), ("loop", [",".join((SOUND_AT_LEVEL_0, *cli.OF_LOOP))]),
+    ("sweep", [SOUND_AT_LEVEL_0]), ("loop", [",".join((SOUND_AT_LEVEL_0, *cli.LOOP_COMPILER_OPTIONS))]),
     ("calibrate", [f"{SOUND_AT_LEVEL_0},{OLDER_EMITTERS}"]),
 ])  # fmt: skip
 def test_flags_are_set_before_jax_is_imported(tmp_path, arguments, flags):
@@ -269,7 +269,7 @@ def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, m
     def short(*_, **__):
         raise ended
 
-    monkeypatch.setattr(Compiled, "__call__", short)
+    monkeypatch.setattr(CompiledJob, "__call__", short)
     code, _, err = mmrjax(command, "--no-report", "--out", "x")
     assert code == 2 and err.endswith("mmrjax: out of memory; use a smaller --chunk, fewer rows, or more memory\n")
     assert "Traceback" not in err and not any(tmp_path.iterdir())
@@ -303,7 +303,7 @@ def test_an_effects_file_cannot_end_the_command_as_if_it_were_done(mmrjax, tmp_p
     def later(*_, **__):
         raise SystemExit(0)
 
-    monkeypatch.setattr(Compiled, "__call__", later)
+    monkeypatch.setattr(CompiledJob, "__call__", later)
     ends(mmrjax("simulate --no-report --out x"), "a file's code ended the program")
     assert [p.name for p in tmp_path.iterdir()] == ["own.py"]
 
@@ -312,7 +312,7 @@ def test_a_file_that_ends_too_early_is_no_interrupt(mmrjax, monkeypatch):
     def short(*_, **__):
         raise EOFError("No data left in file")
 
-    monkeypatch.setattr(Compiled, "__call__", short)
+    monkeypatch.setattr(CompiledJob, "__call__", short)
     _, _, err = ends(mmrjax("simulate --no-report --out x"), "internal error: No data left in file", code=1)
     assert "interrupted" not in err
 

@@ -37,7 +37,7 @@ print(json.dumps({"folder": folder and str(folder), "answer": slope.tolist(),
 
 
 def process(cache, more="", **environment):
-    """What one process did with this value of MMRJAX_CACHE. Warnings are errors."""
+    """Output of one process with this value of MMRJAX_CACHE. Warnings are errors."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_", "TF_CPP"))}
     answer = subprocess.run(
         [sys.executable, "-W", "error:Error", "-c", PROGRAM.replace("{more}", more)],
@@ -80,7 +80,7 @@ def test_broken_entries_are_compiled_again(tmp_path):
 
 
 @pytest.mark.parametrize("word", ["off", "OFF", "0"])
-def test_cache_switched_off_has_no_place(word, monkeypatch):
+def test_cache_switched_off_has_no_folder(word, monkeypatch):
     monkeypatch.setenv("MMRJAX_CACHE", word)
     assert compilation_cache.cache_location() is None
     assert compilation_cache.keep_programs() is None
@@ -88,13 +88,13 @@ def test_cache_switched_off_has_no_place(word, monkeypatch):
 
 
 @pytest.mark.slow
-def test_unwritable_place_switches_the_cache_off(tmp_path):
+def test_unwritable_folder_switches_the_cache_off(tmp_path):
     (tmp_path / "file").write_text("")
     done = process(tmp_path / "file")
     assert done["folder"] is None and done["kept"] == 0
 
 
-def test_place_is_the_users_by_default(monkeypatch, tmp_path):
+def test_default_folder_is_in_the_users_cache(monkeypatch, tmp_path):
     monkeypatch.delenv("MMRJAX_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert compilation_cache.cache_location().parent == tmp_path / "mmrjax"
@@ -108,7 +108,7 @@ def test_place_is_the_users_by_default(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_cache_that_jax_was_given_stays(tmp_path):
+def test_cache_from_jax_settings_takes_precedence(tmp_path):
     done = process(tmp_path / "ours", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "theirs"))
     assert done["folder"] == str(tmp_path / "theirs") and not (tmp_path / "ours").exists()
 

@@ -1,4 +1,4 @@
-"""What a long computation says while it goes on."""
+"""Progress messages of long computations."""
 
 import sys
 import time
@@ -14,29 +14,29 @@ from sweeps import console
 from sweeps.console import step_reporter
 
 
-def test_silence_is_broken_by_what_goes_on():
-    said = []
-    with step_reporter(said.append, "reading", silence=0.2, again=said.append) as tell:
+def test_step_is_repeated_with_its_time_after_a_silence():
+    lines = []
+    with step_reporter(lines.append, "reading", silence=0.2, rewrite=lines.append) as report_step:
         time.sleep(0.5)
-        tell("fitting")
+        report_step("fitting")
         jax.jit(lambda x: jnp.cosh(x) * 0.137)(jnp.ones(3))
         time.sleep(0.7)
-        tell("searching")
+        report_step("searching")
         time.sleep(0.05)
-    count = len(said)
+    count = len(lines)
     time.sleep(0.2)
-    first = said.index("fitting")
-    assert first >= 1 and all(text.startswith("still reading (") for text in said[:first])
-    said = said[first:]
+    first = lines.index("fitting")
+    assert first >= 1 and all(text.startswith("still reading (") for text in lines[:first])
+    lines = lines[first:]
     count -= first
-    assert said[-1] == "searching" and count == len(said)
-    between = said[1:-1]
+    assert lines[-1] == "searching" and count == len(lines)
+    between = lines[1:-1]
     assert len(between) >= 2 and all(text.startswith("still fitting (") for text in between)
     assert "compiled)" in between[-1]
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_a_terminal_writes_one_line_again_and_a_file_gets_none(monkeypatch, capsys, terminal):
+def test_progress_line_is_rewritten_on_a_terminal_and_absent_in_a_file(monkeypatch, capsys, terminal):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
     with step_reporter(console.print_message, "reading", silence=0.05):
         time.sleep(0.3)
@@ -44,7 +44,7 @@ def test_a_terminal_writes_one_line_again_and_a_file_gets_none(monkeypatch, caps
     assert err.count("\r\x1b[Kstill") >= 2 * terminal and bool(err) == terminal, repr(err)
 
 
-def test_a_stage_of_the_loop_has_a_number_and_what_is_left():
+def test_stage_of_the_loop_has_a_number_and_an_expected_time():
     text = describe(progress_remark("bootstrap", 500))
     assert text.startswith(f"2 of {steps.OF}, bootstrap of 500")
     assert steps.expected_time(text, 45.0) == pytest.approx(55.0)  # 45 % are over when it begins
@@ -52,8 +52,8 @@ def test_a_stage_of_the_loop_has_a_number_and_what_is_left():
     assert set(steps.STAGES) <= set(steps.STEPS)
 
 
-def test_a_command_says_soon_that_it_works(monkeypatch, capsys):
-    monkeypatch.setattr(console, "FIRST", 0.2)
+def test_slow_command_reports_that_it_is_working(monkeypatch, capsys):
+    monkeypatch.setattr(console, "FIRST_MESSAGE", 0.2)
     with console.report_working("rig check"):
         pass
     with console.report_working("size"):

@@ -1,4 +1,4 @@
-"""The first sentence of a page: it answers, and does not call a run fine that exceeds a limit."""
+"""First sentence of each page: it states the result, and mentions an exceeded limit."""
 
 import numpy as np
 from pages import recorded
@@ -32,7 +32,7 @@ MISSION = {f"energy_to_{name}_Wh": 0.0 for name in mission_report.SINKS} | {
 
 
 def answers():
-    """What a page is of → its first sentence."""
+    """First sentence of each page, by its subject."""
     return {
         "sweep, some beyond a limit": sweep_report.sweep_answer(
             table(["converged"] * 3 + ["slides"], ["", "gearbox_overspeed", "gearbox_overspeed;slips", ""])

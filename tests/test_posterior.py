@@ -12,9 +12,11 @@ from synthetic import calibrated
 from calibration.data import posterior_file as room
 from calibration.data import robot_file
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior
+from calibration.data.runs import read_runs
 from calibration.inference import priors
 from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax.model import params
+from sweeps import config
 from sweeps.points import run
 from tests.commands import refused
 
@@ -64,6 +66,25 @@ def test_draws_have_mean_and_covariance_of_the_posterior(posterior):
     guide = (values[:, 1] - 0.3) / 0.2
     assert np.corrcoef(z, guide)[0, 1] == pytest.approx(-0.06 / (0.3 * 0.32), abs=0.02)
     assert_array_equal(values, posterior.draw(20_000, 0))
+
+
+@pytest.mark.slow
+def test_draws_that_do_not_travel_are_counted_and_leave_the_rest(robot):
+    names = ("6T2A.ground.friction.static",)
+    coordinates = priors.parameter_coordinates(robot, names)
+    wide = posterior_of_coordinates(coordinates, np.zeros(1), np.eye(1))
+    runs = read_runs("measured").where(np.array([0, 2]))  # flat, and 10°, where one in seven slides
+    found = run.simulate_draws(robot, wide, runs, config.Compare(), 300)
+    share = found[run.CONVERGED_SHARE]
+    assert share[0] == 1 and 0.7 < share[1] < 0.95
+    assert np.isfinite(found["speed_mm_s_sd"]).all()
+
+
+def test_a_coordinate_that_does_not_vary_is_drawn_at_its_mean(posterior):
+    fixed = posterior.covariance.copy()
+    fixed[0], fixed[:, 0] = 0, 0
+    values = dataclasses.replace(posterior, covariance=fixed).draw(50, 0)
+    assert np.ptp(values[:, 0]) < 1e-12 and np.ptp(values[:, 1]) > 0
 
 
 def test_an_angle_stays_within_half_a_turn():

@@ -7,6 +7,7 @@ from pages import Tables, drawn, outside
 from test_sweep_store import CONFIG
 
 from sweeps.pages import sweep_figures
+from sweeps.points import zarr_store
 from sweeps.report import sweep_report
 from tests.commands import read_json
 
@@ -61,8 +62,8 @@ def test_page_of_one_axis_has_one_band(page):
 
 @pytest.mark.slow
 def test_points_of_the_page_are_drawn_from_all_chunks_where_there_are_many(page, monkeypatch):
-    monkeypatch.setattr(sweep_report, "THINNED", 60)
-    monkeypatch.setattr(sweep_report, "CHUNKS", 6)
+    monkeypatch.setattr(zarr_store, "SAMPLED_POINTS", 60)
+    monkeypatch.setattr(zarr_store, "SAMPLED_CHUNKS", 6)
     assert "60 settled points drawn at random." in " ".join(page().text.split())
 
 

@@ -47,7 +47,7 @@ def test_a_finished_folder_holds_what_its_manifest_lists(tmp_path):
 @pytest.mark.parametrize(
     "manifest", ["{}", "[]", '{"schema": "theirs/1", "contents": ["manifest.json"]}', "\xff", None]
 )
-def test_force_replaces_no_folder_that_is_none_of_ours(tmp_path, manifest):
+def test_force_does_not_replace_a_foreign_folder(tmp_path, manifest):
     folder = finished(tmp_path / "x")
     if manifest is None:  # ours, with something of the user's in it
         (folder / "thesis.txt").write_text("years of work")
@@ -139,7 +139,7 @@ def test_a_foreign_file_that_comes_during_the_run_is_not_listed_as_ours(tmp_path
     assert (tmp_path / "y.partial/notes.txt").is_file()
 
 
-def test_a_folder_killed_while_its_results_or_its_mark_were_written_is_taken_up(tmp_path):
+def test_a_folder_killed_while_its_results_or_its_lock_were_written_is_resumed(tmp_path):
     folder = RunFolder(tmp_path / "x", LOOP)
     folder.write_text("rows.csv", "")
     folder.close()
@@ -150,7 +150,7 @@ def test_a_folder_killed_while_its_results_or_its_mark_were_written_is_taken_up(
     assert names(finished(tmp_path / "y")) == ["manifest.json", "robot.toml"]
 
 
-def test_a_refusal_keeps_the_work_that_was_taken_up(tmp_path):
+def test_rejected_input_keeps_resumed_work(tmp_path):
     partial = interrupted(tmp_path / "x")
     with refused("refused", BadConfiguration), RunFolder(tmp_path / "x", LOOP):
         raise BadConfiguration("refused")
@@ -202,7 +202,7 @@ def test_a_second_process_is_refused_at_once_and_disturbs_nothing(tmp_path):
     assert names(tmp_path) == ["x", "x/manifest.json", "x/robot.toml"]
 
 
-def test_of_many_processes_at_once_one_finishes(tmp_path):
+def test_one_of_many_concurrent_processes_finishes(tmp_path):
     ends, start = [], threading.Barrier(6)
 
     def run():
@@ -222,7 +222,7 @@ def test_of_many_processes_at_once_one_finishes(tmp_path):
     assert names(tmp_path) == ["x", "x/manifest.json", "x/robot.toml"]
 
 
-def test_what_appears_at_the_path_meanwhile_is_left_alone_and_so_is_the_result(tmp_path):
+def test_path_created_during_the_run_and_the_result_are_both_kept(tmp_path):
     with pytest.raises(OSError, match="exists") as refused, RunFolder(tmp_path / "x", LOOP) as folder:
         (tmp_path / "x").mkdir()
         (tmp_path / "x/thesis.txt").write_text("years of work")
@@ -233,7 +233,7 @@ def test_what_appears_at_the_path_meanwhile_is_left_alone_and_so_is_the_result(t
 
 
 @pytest.mark.parametrize("ended", [MemoryError(), RuntimeError(), OSError(28, os.strerror(28)), KeyboardInterrupt()])
-def test_whatever_ends_a_command_before_anything_was_kept_leaves_nothing(tmp_path, ended):
+def test_command_that_ends_before_its_first_chunk_leaves_no_folder(tmp_path, ended):
     with pytest.raises(type(ended)), RunFolder(tmp_path / "x", LOOP) as folder:
         folder.write_text("robot.toml", "")
         raise ended

@@ -15,6 +15,7 @@ from sweeps.pages.sweep_figures import draw_grid_statuses
 from sweeps.points import scale, tasks
 from sweeps.report.sweep_report import VariedQuantity
 from tests.commands import ends, read_json
+from tests.pages import Tables, drawn
 
 ROBOT = nominal()
 
@@ -32,8 +33,10 @@ def test_search_of_many_points_ends_within_a_millimetre_of_each_ones_limit():
         Obstacle(kind="step", find=True), 5, lambda sizes, told: Ended(sizes), lambda share: None
     )
     largest = found[tasks.LARGEST]
-    assert largest[0] == 0 and np.all(largest <= limits) and np.all(limits[1:4] - largest[1:4] <= tasks.NEAR)
-    assert largest[4] > tasks.SOUGHT["step"][1] - tasks.NEAR
+    assert (
+        largest[0] == 0 and np.all(largest <= limits) and np.all(limits[1:4] - largest[1:4] <= tasks.SEARCH_TOLERANCE)
+    )
+    assert largest[4] > tasks.SEARCH_INTERVALS["step"][1] - tasks.SEARCH_TOLERANCE
     assert [NAMES[k] for k in found[tasks.VERDICT]] == ["slides", "slides", "slides", "tips", "over"]
     assert len(calls) == 10
 
@@ -86,7 +89,7 @@ obstacle_mm = [60, 500]
 """
 
 
-def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypatch):
+def test_interrupted_map_resumes_after_its_last_chunk(mmrjax, tmp_path, monkeypatch):
     """Climbs in closed form: what a chunk has is kept, what was under way is climbed again.
 
     The interrupt comes while the first chunk waits to be written, as on a machine with idle cores.
@@ -115,6 +118,33 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     assert climbed == [[0.0, 0.0], [30.0, 30.0], [60.0, 60.0]]
     store = zarr.open_group(tmp_path / "map/results.zarr", mode="r")
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
+
+
+@pytest.mark.slow
+def test_page_reports_the_largest_climbed_obstacle_and_its_conditions(mmrjax, tmp_path, monkeypatch):
+    """Climbs in closed form: the steeper the levers the higher, up to the last, which falls."""
+
+    def closed(of, variation, conditions, values, sizes, told):
+        most = np.array([70, 250, 40])[(np.asarray(values)[:, 0] / 30).astype(int)]
+        own = {tasks.LARGEST: most * 1.0} if of.find else {tasks.VERDICT: np.where(sizes <= most, OVER, TIPS)}
+        found = {name: np.full(len(most), 1.0) for name in tasks.climb_attributes(of)} | own
+        found[tasks.VERDICT] = found[tasks.VERDICT].astype(np.uint8)
+        return {**found, STATUS: np.zeros(len(most), np.uint8)}
+
+    monkeypatch.setattr(tasks, "compute_climbs", closed)
+    text = MAP.replace("report = false", "")
+    (tmp_path / "map.toml").write_text(text)
+    (tmp_path / "find.toml").write_text(
+        text.replace("obstacle_mm = [60, 500]", "adhesion = [0.5]").replace('"step"', '"step"\nfind = true')
+    )
+    for name, size in {"map": 60, "find": 250}.items():
+        assert mmrjax("sweep", f"{name}.toml", "--out", name)[0] == 0
+        page = (tmp_path / name / "report.html").read_text("utf-8")
+        where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg, adhesion 0.5"
+        assert f"The largest obstacle that the robot gets over: {size} mm, at {where}." in page
+    page = (tmp_path / "map/report.html").read_text("utf-8")
+    names = {name: (meaning, unit) for name, meaning, unit, _ in Tables(page).tables["names"][1:]}
+    assert names["obstacle_mm"] == ("height of the step", "mm") and "endings" in drawn(page)
 
 
 @pytest.mark.slow

@@ -114,11 +114,11 @@ def test_result_counts_statuses_and_states_ranges(whole):
 def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrjax, tmp_path, monkeypatch):
     """Above the limit: no runs.csv, which is said. The same command with --export csv writes it, simulating nothing."""
     grid = ["sweep", "--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--no-report"]
-    monkeypatch.setattr("sweeps.commands.sweep.TABLE", 12)
+    monkeypatch.setattr("sweeps.commands.sweep.MAX_TABLE_RUNS", 12)
     small, _, _ = mmrjax(*grid, "--out", "small")
     assert small == 0  # some slide
     assert (tmp_path / "small/runs.csv").exists() and not (tmp_path / "small" / zarr_store.STORE).exists()
-    monkeypatch.setattr("sweeps.commands.sweep.TABLE", 11)
+    monkeypatch.setattr("sweeps.commands.sweep.MAX_TABLE_RUNS", 11)
     code, out, said = mmrjax(*grid, "--out", "large")
     assert code == small and out.splitlines()[-1] == "large"
     assert "12 points: too many for runs.csv (11), see results.zarr" in said
@@ -190,7 +190,7 @@ def compare(one, other, rtol=1e-12):
 
 def test_finished_sweep_is_not_simulated_again(sweep, monkeypatch, tmp_path):
     assert sweep("s")[0] == 0
-    monkeypatch.setattr(scale, "Compiled", None)
+    monkeypatch.setattr(scale, "CompiledJob", None)
     _, out, _ = ends(sweep("s", "--export", "parquet"), code=0)
     assert out.splitlines()[-1] == "s" and (tmp_path / "s/runs.parquet").is_file()
     ends(
@@ -243,7 +243,7 @@ def stopping(monkeypatch, at, error):
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 STOPS = {
-    130: (KeyboardInterrupt(), "resume after the last complete chunk"),
+    130: (KeyboardInterrupt(), "continues after the last complete chunk"),
     2: (FULL, "s.partial: No space left on device after 5 of 12 chunks. Free some space"),
 }
 
@@ -256,8 +256,8 @@ def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, t
     ends(sweep("s"), said, code=code)
     assert not (tmp_path / "s").exists()
     heal()
-    computed, honest = [], scale.Compiled.__call__
-    monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
+    computed, honest = [], scale.CompiledJob.__call__
+    monkeypatch.setattr(scale.CompiledJob, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
     _, _, err = ends(sweep("s"), code=0)
     assert not (tmp_path / "s.partial").exists()
     done = CHUNKS - len(computed)
@@ -461,7 +461,7 @@ def test_process_whose_store_was_replaced_meanwhile_does_not_write_into_the_new_
     with refused(r"s\.partial contains another sweep, which differs in configuration", BadConfiguration):
         early.begin()
     forced.begin()
-    assert str(os.getpid()) in forced._aside.name
+    assert str(os.getpid()) in forced._temporary.name
 
 
 @pytest.mark.parametrize("cut", range(4))
@@ -532,8 +532,8 @@ def victim(folder, name):
 
 
 def finished(store):
-    with store.last() as last:
-        assert last
+    with store.finishing() as finishes:
+        assert finishes
         names = ["identity.json", "journal", "manifest.json", zarr_store.STORE]
         store.write_json("manifest.json", {"schema": MANIFEST, "contents": names})
         store.move_into_place()
@@ -642,12 +642,12 @@ def test_chunk_is_split_along_the_points_among_all_devices():
         "robot = mmrjax.nominal()\n"
         "plan = axes.plan_design(Campaign(axes={'voltage': [15, 20, 24, 28, 33]}), robot, 'x')\n"
         "job = scale.Job(robot, run_task('steady', {}, robot), plan, ('speed',), 'float64', Blocks.of((5,), 5))\n"
-        "compiled = scale.Compiled(job)\n"
+        "compiled = scale.CompiledJob(job)\n"
         "found = compiled(compiled.points(0))['speed']\n"
         "print(len(found.sharding.device_set), [s.data.shape for s in found.addressable_shards], tuple(found.sharding.spec))\n"
         "rows = mmrjax.Conditions(voltage=np.array([15.0, 20, 24, 28, 33]))\n"
         "job = scale.Job(robot, run_task('steady', {}, robot), axes.SweepPlan.of_rows(rows), ('speed',), 'float64', Blocks.of((5,), 5))\n"
-        "compiled = scale.Compiled(job)\n"
+        "compiled = scale.CompiledJob(job)\n"
         "table = compiled(compiled.points(0))['speed']\n"
         "print(len(table.sharding.device_set), bool((table == found).all()))"
     )
@@ -671,7 +671,9 @@ def test_dry_run_states_points_chunks_bytes_and_time_and_writes_nothing(sweep, t
 
 def laid_out_of(**stated):
     config, robot = Campaign(**stated), paper_robots.nominal()
-    config = config.model_copy(update={"outputs": config.outputs or task_of_configuration(config, robot).usual})
+    config = config.model_copy(
+        update={"outputs": config.outputs or task_of_configuration(config, robot).default_outputs}
+    )
     return store_layout(config, prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x"))
 
 

@@ -15,6 +15,7 @@ from mmrjax.model import params
 from sweeps import config
 from sweeps.points import run, scale
 from sweeps.points.sampled_design import DrawnSamples
+from sweeps.store import RunFolder
 from tests.test_sweep_posterior import NAMES, correlated_posterior
 
 DRAWS = 12
@@ -78,7 +79,7 @@ def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, po
     assert_allclose(found["speed_mm_s_sd"][:3], speeds.std(0, ddof=1)[:3], rtol=1e-9)
     low = np.quantile(speeds[:, :3], run.QUANTILES[0], axis=0)
     assert_allclose(found["speed_mm_s_lower"][:3], low, rtol=1e-12)
-    assert found[run.SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found["speed_mm_s_sd"][3])
+    assert found[run.CONVERGED_SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found["speed_mm_s_sd"][3])
 
 
 @pytest.mark.slow
@@ -90,7 +91,33 @@ def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
 
 
 @pytest.mark.slow
-def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monkeypatch):
+def test_interrupted_draws_are_resumed(robot, runs, posterior, tmp_path, monkeypatch):
+    whole = run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS)
+    folder, computed, honest = RunFolder(tmp_path / "r", {}), [], scale.CompiledJob.__call__
+
+    def interrupted(compiled, values, *told):
+        if len(computed) == 2:
+            raise KeyboardInterrupt
+        computed.append(compiled)
+        return honest(compiled, values, *told)
+
+    monkeypatch.setattr(scale.CompiledJob, "__call__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
+    kept = len(list((tmp_path / "r.partial/chunks").glob("draws-*.stage")))
+    assert kept <= 2
+    computed.clear()
+    monkeypatch.setattr(scale.CompiledJob, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
+    same(run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder), whole)
+    assert len(computed) == 4 - kept
+    again = run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
+    assert len(computed) == 4 - kept  # nothing is left to do
+    same(again, whole)
+    folder.close()
+
+
+@pytest.mark.slow
+def test_slow_computations_run_in_parts_and_report_their_share(robot, runs, monkeypatch):
     from mmrjax.fidelities import steady
 
     honest = steady.FIDELITY
@@ -113,6 +140,6 @@ def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monke
 def test_chunks_are_filled_up_to_share_programs(robot, runs):
     """Of settled points those of few too. What runs over time takes longer than its program does to compile."""
     many = dataclasses.replace(runs, columns={k: np.tile(v, 4200) for k, v in runs.columns.items()})
-    sizes = [scale.Compiled(run.job_of_run_table(robot, r, chunked(None))).size for r in (runs, many)]
-    assert sizes == [fidelities.FEW, 2 * scale.SHARED]
-    assert scale.Compiled(run.job_of_run_table(robot, runs, config.Simulate(model="drive"))).size == 4
+    sizes = [scale.CompiledJob(run.job_of_run_table(robot, r, chunked(None))).size for r in (runs, many)]
+    assert sizes == [fidelities.FEW, 2 * scale.PADDING_MULTIPLE]
+    assert scale.CompiledJob(run.job_of_run_table(robot, runs, config.Simulate(model="drive"))).size == 4

@@ -104,8 +104,8 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     assert heading == ["6T2A, 33 V, 0 kg, 10°", "6T2A, -33 V, 0 kg, -10°"]
     up, back = history_figures.start_runs(robot, found.history, np.asarray(found.status), [0, 0], heading)
     for k, start in enumerate((up, back)):
-        assert start.ended[0] == pytest.approx(abs(float(found.total_current[k])), rel=1e-6)
-        assert start.ended[1] == pytest.approx(1e3 * abs(float(found.speed[k])), rel=1e-6)
+        assert start.end_values[0] == pytest.approx(abs(float(found.total_current[k])), rel=1e-6)
+        assert start.end_values[1] == pytest.approx(1e3 * abs(float(found.speed[k])), rel=1e-6)
         assert start.gets_under_way and start.current.max() > 90
     assert (up.stages.sense, back.stages.sense) == (1.0, -1.0)  # the way back is drawn as the way there
     assert (*up.stages.bounds, up.stages.settled) == pytest.approx((*back.stages.bounds, back.stages.settled))

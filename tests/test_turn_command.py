@@ -20,7 +20,7 @@ from mmrjax.model.quantities import HEAT
 from sweeps.capabilities import UNLIMITED
 from sweeps.commands import simulate
 from sweeps.pages import mission_figures
-from sweeps.points.job import showing_turns
+from sweeps.points.job import robot_for_turns
 from sweeps.report import run_tables, runs_report, turn_words
 from tests.commands import ends, read_json, refused, rows, text_file
 
@@ -158,8 +158,8 @@ PLAN = '[conditions]\nconfiguration = "6T2A"\nvoltage = 24\nduty_right = 1\n[axe
 
 
 def test_a_sweep_over_duties_of_sides_shows_both_and_one_of_straight_travel_as_before(robot):
-    assert showing_turns(robot, {"voltage", "slope_deg"}) is robot
-    shown = showing_turns(robot, {"voltage", "duty_left"}).channels
+    assert robot_for_turns(robot, {"voltage", "slope_deg"}) is robot
+    shown = robot_for_turns(robot, {"voltage", "duty_left"}).channels
     assert {"yaw_rate", "motor_current_left", "speed"} <= {c.name for c in shown}
 
 

@@ -26,35 +26,37 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 COLUMNS = ("name", "sense", "required", "value", "margin", "unit", "met", "status", "at")
 
 
-def execute(config: configuration.Check, beside: configuration.FolderPart) -> int:
+def execute(config: configuration.Check, invocation: configuration.FolderPart) -> int:
     """Compares a robot with requirements and writes a run folder. Returns the exit code.
 
     The code is 0 whether or not requirements are missed, and 3 if the solver failed at a worst corner.
     """
-    demands = requirements_file.load_requirements(Path(config.requirements))
+    requirements = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
     capabilities.check_on_ground(robot, "check")
-    sheet.reject_impossible(robot, demands)
-    for r in demands.each:
-        depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
-        if depends and r.envelope.battery and not capabilities.has_battery(robot):
+    sheet.reject_impossible(robot, requirements)
+    for requirement in requirements.each:
+        needs_charge = CHARGE in requirement.quantity.axes or requirement.quantity.group == "endurance"
+        if needs_charge and requirement.envelope.battery and not capabilities.has_battery(robot):
             raise BadConfiguration(
-                f"{demands.source}, {r.name}: the robot's file has no battery; add it, or set "
+                f"{requirements.source}, {requirement.name}: the robot's file has no battery; add it, or set "
                 "supply_voltage_V in [envelope]"
             )
     lacking = robot.unknown(HEAT)
-    for r in demands.each:
-        if lacking and r.name in OF_HEAT:
+    for requirement in requirements.each:
+        if lacking and requirement.name in OF_HEAT:
             raise BadConfiguration(
-                f"{demands.source}, {r.name}: needs the winding temperature, for which the robot's file lacks "
-                f"{', '.join(lacking)}; add them"
+                f"{requirements.source}, {requirement.name}: needs the winding temperature, for which the robot's "
+                f"file lacks {', '.join(lacking)}; add them"
             )
-    with open_folder("check", config, robot, beside) as folder:
+    with open_folder("check", config, robot, invocation) as folder:
         with step_reporter(print_message, "reading the requirements") as report:
-            outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=report_in_words(report))
-            result = CheckResult(demands, robot, outcomes)
-        folder.write_text("requirements.toml", demands.text)
+            outcomes = sheet.check_requirements(
+                robot, requirements, changes=config.changes, tell=report_in_words(report)
+            )
+            result = CheckResult(requirements, robot, outcomes)
+        folder.write_text("requirements.toml", requirements.text)
         rows = [
             (r.name, r.sense, requirement_limit(o), np.nan if o.value is None else o.value,
              np.nan if o.margin is None else o.margin, r.quantity.unit, o.met, o.status, worst_corner_text(o))
@@ -63,9 +65,9 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
         columns = zip(COLUMNS, zip(*rows, strict=True), strict=True)
         folder.write_table("requirements.csv", {name: np.array(values) for name, values in columns})
         folder.write_json("result.json", result.to_json())
-        document = print_report(
+        page = print_report(
             check_report.check_document(result, capabilities.displayed_name(file), config.changes), file
         )
         manifest = {"seed": None, **sheet.count_outcomes(result.outcomes)}
-        solved = words.every_run_solved(Counter(o.status for o in result.outcomes))
-        return finish_run_folder(folder, manifest, document, solved)
+        solved = words.every_run_solved(Counter(outcome.status for outcome in result.outcomes))
+        return finish_run_folder(folder, manifest, page, solved)

@@ -52,8 +52,10 @@ def explain_name(name: str | None, files: Names) -> int:
         print_output("mmrjax explain NAME explains one.")
         return 0
     names = [n for by_name in kinds.values() for n in by_name]
-    every = (*OUTPUTS, *channels.EVERY, *quantities.SET, *quantities.LABELS)
-    columns = {getattr(q, field, None): q.name for q in every for field in ("column", "sd_column", "field")}
+    quantities_shown = (*OUTPUTS, *channels.EVERY, *quantities.SET, *quantities.LABELS)
+    columns = {
+        getattr(q, field, None): q.name for q in quantities_shown for field in ("column", "sd_column", "field")
+    }
     key = name if name in names else columns.get(name, name)
     for kind, by_name in kinds.items():
         if key in by_name:
@@ -61,10 +63,10 @@ def explain_name(name: str | None, files: Names) -> int:
             for heading, text in by_name[key]():
                 print_output(_wrapped(heading, text))
     if key not in names:
-        if below := [p for p in kinds["parameter"] if p.endswith(f".{name}")]:
-            raise BadConfiguration(f"explain: got {name}; did you mean one of these? {', '.join(below)}")
-        close = similar_words(name, names, 3)
-        hint = f"did you mean {', '.join(close)}? " if close else ""
+        if longer_names := [p for p in kinds["parameter"] if p.endswith(f".{name}")]:
+            raise BadConfiguration(f"explain: got {name}; did you mean one of these? {', '.join(longer_names)}")
+        similar_names = similar_words(name, names, 3)
+        hint = f"did you mean {', '.join(similar_names)}? " if similar_names else ""
         raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists all names")
     return 0
 
@@ -72,30 +74,36 @@ def explain_name(name: str | None, files: Names) -> int:
 def explanations(library: Library) -> dict[str, dict[str, Callable[[], Lines]]]:
     """Functions that return the lines on each name, by kind and name."""
     robot = paper_robots.nominal()
-    verdict = "verdict of result.json of mmrjax {}"
-    loop, climb = words.LOOP_VERDICTS, {name: meaning for name, (_, meaning) in VERDICTS.items()}
-    keys = {name: meaning for name, (_, _, meaning) in robot_file.SETTINGS.items()}
-    glossary = {name: meaning for name, meaning in words.GLOSSARY.items() if name not in loop}
-    partial = functools.partial
+    verdict_place = "verdict of result.json of mmrjax {}"
+    loop_verdicts = words.LOOP_VERDICTS
+    climb_verdicts = {name: meaning for name, (_, meaning) in VERDICTS.items()}
+    file_keys = {name: meaning for name, (_, _, meaning) in robot_file.SETTINGS.items()}
+    glossary = {name: meaning for name, meaning in words.GLOSSARY.items() if name not in loop_verdicts}
+    lines_of = functools.partial
     return {
-        "effect": {n: partial(_effect_lines, e) for n, e in library.items() if n not in effects.UNNAMED},
-        "status": {name: partial(_status_lines, name) for name in words.STATUSES},
-        "verdict of the loop": _from_table(loop, verdict.format("loop")),
-        "verdict of a climb": _from_table(climb, verdict.format("climb")),
+        "effect": {
+            name: lines_of(_effect_lines, effect) for name, effect in library.items() if name not in effects.UNNAMED
+        },
+        "status": {name: lines_of(_status_lines, name) for name in words.STATUSES},
+        "verdict of the loop": _from_table(loop_verdicts, verdict_place.format("loop")),
+        "verdict of a climb": _from_table(climb_verdicts, verdict_place.format("climb")),
         "flag": _from_table(words.FLAGS, "column flags of runs.csv, counts in result.json"),
-        "channel": {c.name: partial(_channel_lines, c, library) for c in channels.EVERY},
-        "output": {o.name: partial(_output_lines, o.name) for o in OUTPUTS},
-        "parameter": {p.name: partial(_parameter_lines, p, robot, library) for p in params.walk_parameters(robot)},
-        "key of a robot file": _from_table(keys),
-        "condition": {c.name: partial(_condition_lines, c) for c in (*quantities.LABELS, *quantities.SET)},
+        "channel": {channel.name: lines_of(_channel_lines, channel, library) for channel in channels.EVERY},
+        "output": {output.name: lines_of(_output_lines, output.name) for output in OUTPUTS},
+        "parameter": {
+            parameter.name: lines_of(_parameter_lines, parameter, robot, library)
+            for parameter in params.walk_parameters(robot)
+        },
+        "key of a robot file": _from_table(file_keys),
+        "condition": {c.name: lines_of(_condition_lines, c) for c in (*quantities.LABELS, *quantities.SET)},
         "word of the reports": _from_table(glossary),
     }
 
 
 def _from_table(meanings: Mapping[str, str], where: str = "") -> dict[str, Callable[[], Lines]]:
     """Explanations of the names in a table of meanings. `where`: files in which they occur."""
-    further = [("in files", where)] * bool(where)
-    return {name: functools.partial(list, [("means", text), *further]) for name, text in meanings.items()}
+    place_lines = [("in files", where)] * bool(where)
+    return {name: functools.partial(list, [("means", text), *place_lines]) for name, text in meanings.items()}
 
 
 def _wrapped(heading: str, text: str) -> str:
@@ -123,8 +131,8 @@ def _effect_lines(effect: type[Effect]) -> Lines:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
     if declarations := ", ".join(experiment_words.effect_declarations(effect)):
         yield "properties", declarations
-    hidden = f". Settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
-    yield "in data", f"{effect.family()}{'. Only time histories show it' if effect.transient else hidden}"
+    settled_text = f". Settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
+    yield "in data", f"{effect.family()}{'. Only time histories show it' if effect.transient else settled_text}"
     for line in _change_sentences(example):
         yield "", line
     for k, test in enumerate(experiment_words.effect_tests(effect)):
@@ -147,20 +155,20 @@ def _change_sentences(effect: Effect) -> Iterable[str]:
 
     robot = paper_robots.nominal()
     spec = next(p.spec for p in params.walk_parameters(effect) if p.spec.amplitude)
-    within = dataclasses.replace(robot, effects=(effect,))
-    run = mm.Conditions(
+    with_effect = dataclasses.replace(robot, effects=(effect,))
+    conditions = mm.Conditions(
         list(robot.configurations), voltage=24.0, slope_deg=5.0, payload=3.0, battery=float(effect.needs_battery)
     )
-    sized = params.replace(within, {f"effects.{effect.name}.amplitude": np.asarray(spec.prior_sd(0.0))})
-    without, with_it = (mm.simulate(r, run) for r in (within, sized))
+    typical_size = params.replace(with_effect, {f"effects.{effect.name}.amplitude": np.asarray(spec.prior_sd(0.0))})
+    without, with_it = (mm.simulate(r, conditions) for r in (with_effect, typical_size))
     for k, name in enumerate(robot.configurations):
         shares = {}
         for c in robot.channels:
             reading_without, reading_with = float(without.reading[c.name][k]), float(with_it.reading[c.name][k])
             if np.isfinite(reading_with) and reading_without:
                 shares[c.label] = 100 * (reading_with / reading_without - 1)
-        if any(abs(x) > 5e-3 for x in shares.values()):
-            changes = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
+        if any(abs(percent) > 5e-3 for percent in shares.values()):
+            changes = ", ".join(f"{label} {percent:+.2g} %" for label, percent in shares.items())
             yield f"change at its typical size ({name}, 24 V, 5°, 3 kg): {changes}"
 
 
@@ -170,31 +178,37 @@ def _status_lines(name: str) -> Lines:
     yield "in files", "column status of runs.csv, counts in result.json"
 
 
-def _channel_lines(c: Channel, library: Library) -> Lines:
-    low, high = c.range
-    yield "is", f"{c.label} [{c.unit_shown}], as shown by its instrument{c.where and f': {c.where}'}"
-    yield "column", f"{c.column}, its standard deviation {c.sd_column}, {low:g} to {high:g}"
-    if c.other_units:
-        yield "other units", ", ".join(c.other_units)
-    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, assumed without a stated noise"
-    yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
-    sensor_effects = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
+def _channel_lines(channel: Channel, library: Library) -> Lines:
+    low, high = channel.range
+    yield (
+        "is",
+        f"{channel.label} [{channel.unit_shown}], as shown by its instrument{channel.where and f': {channel.where}'}",
+    )
+    yield "column", f"{channel.column}, its standard deviation {channel.sd_column}, {low:g} to {high:g}"
+    if channel.other_units:
+        yield "other units", ", ".join(channel.other_units)
+    yield "typical noise", f"{100 * channel.sd_share:g} % of the reading, assumed without a stated noise"
+    yield "shows in", " and ".join(["settled runs"] * channel.settled + ["histories"] * channel.over_time)
+    sensor_effects = [e for e in library.values() if e.channel == channel.name and e.name not in effects.UNNAMED]
     if sensor_effects:
         yield "its errors", ", ".join(e.name for e in sensor_effects)
         for k, test in enumerate(experiment_words.effect_tests(sensor_effects[0])):
             yield "" if k else "on a bench", test
 
 
-def _condition_lines(c: Any) -> Lines:
-    if isinstance(c, Condition):
-        yield "is", f"{c.label} [{c.unit_shown or '-'}], {c.range[0]:g} to {c.range[1]:g}"
-        if c.other_units:
-            yield "other units", ", ".join(c.other_units)
-        if c.field:
-            yield "from Python", f"mm.Conditions({c.field}=...)"
+def _condition_lines(condition: Any) -> Lines:
+    if isinstance(condition, Condition):
+        yield (
+            "is",
+            f"{condition.label} [{condition.unit_shown or '-'}], {condition.range[0]:g} to {condition.range[1]:g}",
+        )
+        if condition.other_units:
+            yield "other units", ", ".join(condition.other_units)
+        if condition.field:
+            yield "from Python", f"mm.Conditions({condition.field}=...)"
     else:
-        yield "is", c.label
-    yield "column", c.column
+        yield "is", condition.label
+    yield "column", condition.column
 
 
 def _output_lines(name: str) -> Lines:
@@ -225,9 +239,9 @@ def _parameter_lines(parameter: Parameter, robot: Robot, library: Library) -> Li
     equation = " ".join((inspect.getdoc(type(part)) or "").partition("\n\nAttributes:")[0].split())
     if part is not robot and equation:
         yield "equation", equation
-    rests = [e.name for e in library.values() if name in e.rests_on]
-    if rests:
-        yield "scales", ", ".join(rests)
+    scaled_effects = [e.name for e in library.values() if name in e.rests_on]
+    if scaled_effects:
+        yield "scales", ", ".join(scaled_effects)
     yield (
         "change it",
         f"--set {name}=VALUE, or [{name.rpartition('.')[0]}] {name.rpartition('.')[2]} = VALUE in a file",

@@ -19,10 +19,10 @@ from sweeps.report import export_report
 from sweeps.store import finish_run_folder, open_folder, print_report
 
 
-def execute(config: configuration.Export, beside: configuration.FolderPart) -> int:
+def execute(config: configuration.Export, invocation: configuration.FolderPart) -> int:
     """Exports a drive and writes a run folder with its files. Returns the exit code, 0."""
     file = load_robot(config)
-    with open_folder("export", config, file.robot, beside) as folder:
+    with open_folder("export", config, file.robot, invocation) as folder:
         exported = export_format(
             file, config.to, configuration=config.configuration, data=config.data, at=config.joint,
             draws=config.draws, seed=config.seed,
@@ -31,36 +31,36 @@ def execute(config: configuration.Export, beside: configuration.FolderPart) -> i
             folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
         folder.write_text("LAW.md", export_report.law_text(exported))
         folder.write_json("result.json", to_json(exported))
-        document = print_report(export_report.export_document(exported))
+        page = print_report(export_report.export_document(exported))
         folder.runs = exported.comparison.situation.runs
-        return finish_run_folder(folder, {"seed": config.seed}, document)
+        return finish_run_folder(folder, {"seed": config.seed}, page)
 
 
-def to_json(found: Export) -> Json:
+def to_json(exported: Export) -> Json:
     """`result.json`."""
-    compared = found.comparison
+    comparison = exported.comparison
     return {
         "schema": "mmrjax.export/1",
-        "format": found.format,
-        "robot": found.joint.file.name,
-        "configuration": found.joint.configuration,
-        "statement": export_report.export_statement(found),
-        "runs": len(compared.situation.command),
-        "source": compared.situation.source,
-        "reference": compared.reference,
-        "errors_percent": compared.errors,
-        "translated": dict(compared.translated),
-        "refitted": dict(compared.refitted),
+        "format": exported.format,
+        "robot": exported.joint.file.name,
+        "configuration": exported.joint.configuration,
+        "statement": export_report.export_statement(exported),
+        "runs": len(comparison.situation.command),
+        "source": comparison.situation.source,
+        "reference": comparison.reference,
+        "errors_percent": comparison.errors,
+        "translated": dict(comparison.translated),
+        "refitted": dict(comparison.refitted),
         "effects": [
-            {"name": f.name, "verdict": f.verdict, "how": f.how, "share_kept": f.kept} for f in compared.fates
+            {"name": f.name, "verdict": f.verdict, "how": f.how, "share_kept": f.kept} for f in comparison.fates
         ],
-        "idle": list(found.joint.idle),
-        "checks": dict(found.checks),
+        "idle": list(exported.joint.idle),
+        "checks": dict(exported.checks),
         "constants": [
             {"name": c.name, "value": c.value, "unit": c.unit, "low": c.low, "high": c.high, "source": c.source}
-            for c in found.constants
+            for c in exported.constants
         ],
-        "files": sorted(found.files),
+        "files": sorted(exported.files),
     }
 
 
@@ -100,14 +100,14 @@ def export(
     exported = export_format(
         file, to, configuration=configuration, data=data, at=joint, draws=draws, seed=seed, posterior=posterior
     )
-    texts = {**exported.files, "LAW.md": export_report.law_text(exported)}
-    exported = dataclasses.replace(exported, files=texts)
+    files = {**exported.files, "LAW.md": export_report.law_text(exported)}
+    exported = dataclasses.replace(exported, files=files)
     if out is not None:
         folder = Path(out)
-        if existing_file := next((folder / name for name in texts if (folder / name).exists()), None):
+        if existing_file := next((folder / name for name in files if (folder / name).exists()), None):
             raise BadConfiguration(f"out: {existing_file} exists already; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        for name, content in texts.items():
+        for name, content in files.items():
             with naming_file(folder / name):
                 (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     return exported

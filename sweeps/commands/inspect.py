@@ -27,7 +27,10 @@ def inspect_file(file: str, as_json: bool) -> int:
     heads = columns(
         "signal", "unit", "samples |", "Hz | .6g", "gaps | .0f", "from | .6g", "to | .6g", "missing |", "words"
     )
-    said = [*(f"{s.path} {s.refused}" for s in source.signals if s.refused), *source.notes]
+    remark_texts = [
+        *(f"{signal.path} {signal.refused}" for signal in source.signals if signal.refused),
+        *source.notes,
+    ]
     proposals = []
     if source.preset:
         numbers = "".join(f",{key}=..." for key in presets_file.numbers_to_state(source.preset))
@@ -36,5 +39,5 @@ def inspect_file(file: str, as_json: bool) -> int:
         proposals.append("\n".join(["Proposal for the robot's file, to be checked:", "[columns]", *source.proposed]))
     answer = f"{source.name}: {source.kind}, {count_noun(len(source.signals), 'signal')}"
     notes = (Note(text, terminal=True) for text in proposals)
-    print_document(Document(source.name, answer, (Table("signals", heads, rows), *remarks(said), *notes)))
+    print_document(Document(source.name, answer, (Table("signals", heads, rows), *remarks(remark_texts), *notes)))
     return 0

@@ -27,15 +27,16 @@ def check_installation() -> int:
         "derivatives": _check_derivative,
         "writing here": _check_folder,
     }
-    healthy = True
+    all_pass = True
     for k, (name, check) in enumerate(checks.items(), 1):
         try:
             with report_stage(k, len(checks), name):
                 line = f"{name}: {check()}"
         except Exception as error:
-            line, healthy = f"{name} FAILED: {type(error).__name__}: {error}", False
+            line = f"{name} FAILED: {type(error).__name__}: {error}"
+            all_pass = False
         print(line)
-    return 0 if healthy else 1
+    return 0 if all_pass else 1
 
 
 def _check_run() -> str:
@@ -47,12 +48,13 @@ def _check_run() -> str:
     from mmrjax.model.conditions import Conditions
 
     robot = paper_robots.nominal()
-    words = ("friction_", "loss_", "rolling", "guide_share")
-    losses = [p.name for p in params.walk_parameters(robot) if any(word in p.name for word in words)]
-    ideal = params.replace(robot, dict.fromkeys(losses, jnp.asarray(0.0)))
+    loss_words = ("friction_", "loss_", "rolling", "guide_share")
+    losses = [p.name for p in params.walk_parameters(robot) if any(word in p.name for word in loss_words)]
+    lossless = params.replace(robot, dict.fromkeys(losses, jnp.asarray(0.0)))
     start = time.perf_counter()
-    answer = steady_batch(ideal, Conditions(voltage=jnp.array([24.0])))
-    motor_speed, no_load_speed = float(answer.motor_speed[0]), 24.0 / float(robot.motor.torque_constant)
+    result = steady_batch(lossless, Conditions(voltage=jnp.array([24.0])))
+    motor_speed = float(result.motor_speed[0])
+    no_load_speed = 24.0 / float(robot.motor.torque_constant)
     if not math.isclose(motor_speed, no_load_speed, rel_tol=1e-9):
         raise ArithmeticError(f"no-load speed {motor_speed} rad/s; known {no_load_speed} rad/s")
     return f"no-load speed {motor_speed:.3f} rad/s = 24 V / C_E ({time.perf_counter() - start:.1f} s with compiling)"
@@ -65,16 +67,17 @@ def _check_derivative() -> str:
     from mmrjax.model import paper_robots, params
     from mmrjax.model.conditions import Conditions
 
-    robot, run = paper_robots.nominal(), Conditions()
+    robot = paper_robots.nominal()
+    run = Conditions()
 
     def current(friction: params.Scalar) -> jax.Array:
         return steady(params.replace(robot, {"motor.friction_coulomb": friction}), run).total_current
 
     x, h = robot.motor.friction_coulomb, 1e-6
-    exact, central = float(jax.grad(current)(x)), float((current(x + h) - current(x - h)) / (2 * h))
-    if not math.isclose(exact, central, rel_tol=1e-5):
-        raise ArithmeticError(f"implicit {exact}; central difference {central}")
-    return f"d(current)/d(motor friction) = {exact:.4f} A/(N·m), as by central difference"
+    by_gradient, by_difference = float(jax.grad(current)(x)), float((current(x + h) - current(x - h)) / (2 * h))
+    if not math.isclose(by_gradient, by_difference, rel_tol=1e-5):
+        raise ArithmeticError(f"implicit {by_gradient}; central difference {by_difference}")
+    return f"d(current)/d(motor friction) = {by_gradient:.4f} A/(N·m), as by central difference"
 
 
 def _check_folder() -> str:

@@ -31,11 +31,11 @@ from sweeps.report.mission_report import Missions
 from sweeps.store import open_folder, print_report
 
 #: Rows of history.csv: most and fewest of one run, and most of all runs together.
-MOST_ROWS, LEAST_ROWS, ALL_ROWS = 20_000, 200, 200_000
-_LASTING = MARKS.index("battery_empty")  # only later marks are kept: stops and starts are too many
+MAX_ROWS, MIN_ROWS, ALL_ROWS = 20_000, 200, 200_000
+_FIRST_MARK_KEPT = MARKS.index("battery_empty")  # only later marks are kept: stops and starts are too many
 
 
-def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
+def execute(config: configuration.Simulate, invocation: configuration.GivenRuns) -> int:
     """Simulates runs from a file, or one run from options, over a profile. Returns the exit code.
 
     Raises:
@@ -73,29 +73,29 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         )
     source.check_supply(config.battery)
     for column in source.stated:
-        if column in beside.stated:
+        if column in invocation.stated:
             raise BadConfiguration(f"{OPTIONS[column]}: {source.source} contains {column} too; keep one of the two")
     capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
     if config.battery and config.discharge_mAh >= capacity:
         raise BadConfiguration(
             f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh"
         )
-    runs = given_runs(robot, beside, config, source.stated)
+    runs = given_runs(robot, invocation, config, source.stated)
     for column in source.stated:
-        if beside.runs is not None and runs.has(column):
+        if invocation.runs is not None and runs.has(column):
             print_message(f"{runs.source}, {column}: not used, because {source.source} gives it")
     if "current_other" in source.values and not config.battery:
         print_message(f"{source.source}, current_other_A: not used, because the battery supplies other consumers")
     _check_turning(robot, runs, source)
     conditions = _conditions_of_runs(robot, runs, source, config)
     profile = source.profile(robot, conditions)
-    cell = mission_batch.cell_below_cutoff(robot, conditions, profile, source.start)
-    if np.isfinite(cell).any():
+    cell_voltages = mission_batch.cell_below_cutoff(robot, conditions, profile, source.start)
+    for voltage in cell_voltages[np.isfinite(cell_voltages)][:1]:
         raise BadConfiguration(
-            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[np.isfinite(cell)][0]:.4g} V, "
-            f"below its cut-off of {robot.battery.voltage_cutoff:g} V, before the mission"
+            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {voltage:.4g} V, below its cut-off of "
+            f"{robot.battery.voltage_cutoff:g} V, before the mission"
         )
-    with open_folder("simulate", config, robot, beside, runs) as folder:
+    with open_folder("simulate", config, robot, invocation, runs) as folder:
         missions = run_missions(robot, runs, source, conditions, profile)
         columns = _condition_columns(robot, runs, source, config)
         missions = dataclasses.replace(missions, table=columns | missions.table)
@@ -144,28 +144,31 @@ def run_missions(
 ) -> Missions:
     """Simulates runs over a profile. The table has no conditions yet."""
     names = run.run_names(runs)
-    most = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
-    tables: list[Columns] = []
-    segments: list[Columns] = []
-    courses: list[Columns] = []
+    max_rows = max(MIN_ROWS, min(MAX_ROWS, ALL_ROWS // len(runs)))
+    run_tables: list[Columns] = []
+    segment_tables: list[Columns] = []
+    course_tables: list[Columns] = []
     is_complete = True
     with progress_bar(len(runs), quiet=False) as advance:
         for batch in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
-            first, count = len(courses), len(batch.steps)
-            part = jax.tree.map(lambda x, a=first, b=first + count: np.asarray(x)[a:b], conditions)
-            numbers = mission_batch.mission_numbers(robot, part, batch)
+            first = len(course_tables)
+            count = len(batch.steps)
+            batch_conditions = jax.tree.map(lambda x, a=first, b=first + count: np.asarray(x)[a:b], conditions)
+            numbers = mission_batch.mission_numbers(robot, batch_conditions, batch)
             words = outputs.status_words(batch.result.status, batch.result.flags)
-            tables.append({**mission_batch.numbers_by_column(jax.device_get(numbers)), **words})
-            totals = mission_batch.mission_totals(batch.segments, batch.segment_peaks)
-            of_segments = mission_batch.numbers_by_column(jax.device_get(totals))
+            run_tables.append({**mission_batch.numbers_by_column(jax.device_get(numbers)), **words})
+            segment_totals = mission_batch.mission_totals(batch.segments, batch.segment_peaks)
+            segment_numbers = mission_batch.numbers_by_column(jax.device_get(segment_totals))
             for k, name in enumerate(names[first : first + count]):
-                one, given, of_run = jax.tree.map(lambda x, k=k: x[k], (batch, part, of_segments))
-                segments.append(_segment_rows(robot, given, source, one, of_run, name))
-                courses.append(_course_rows(robot, given, source, one, name, most))
+                mission, run_conditions, run_segments = jax.tree.map(
+                    lambda x, k=k: x[k], (batch, batch_conditions, segment_numbers)
+                )
+                segment_tables.append(_segment_rows(robot, run_conditions, source, mission, run_segments, name))
+                course_tables.append(_course_rows(robot, run_conditions, source, mission, name, max_rows))
             assert batch.course is not None  # it was asked for
             is_complete &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
             advance(count)
-    table, segment_rows, course = map(_concatenate_tables, (tables, segments, courses))
+    table, segment_rows, course = map(_concatenate_tables, (run_tables, segment_tables, course_tables))
     return Missions(table, segment_rows, course, source, is_complete)
 
 
@@ -179,10 +182,10 @@ def _condition_columns(
 ) -> Columns:
     """Conditions of the runs, empty if the profile states them or the battery determines them."""
     empty_column = np.full(len(runs), np.nan)
-    unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
-    unknown |= {"total_mass_kg"} if "payload_kg" in unknown else set()
+    emptied = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
+    emptied |= {"total_mass_kg"} if "payload_kg" in emptied else set()
     columns = {
-        key: empty_column if key in unknown else value for key, value in run.condition_table(robot, runs).items()
+        key: empty_column if key in emptied else value for key, value in run.condition_table(robot, runs).items()
     }
     if source.surface is not None:
         columns.pop(profiles.SURFACE, None)
@@ -190,16 +193,19 @@ def _condition_columns(
 
 
 def _segment_rows(
-    robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, numbers: Columns, name: str
+    robot: Robot, conditions: Conditions, source: ProfileTable, mission: Mission, numbers: Columns, name: str
 ) -> Columns:
     """Rows of segments.csv for one run: each segment of each cycle, up to the end of the run."""
-    assert found.course is not None  # it was asked for
-    cycles, segments = found.status.shape
-    number, time = np.arange(cycles * segments), np.ravel(found.segments.time)
-    steps = np.where(found.course.segment < 0, len(number), found.course.segment)  # after the end, beyond the last
-    last = np.maximum(np.searchsorted(steps, number, side="right") - 1, 0)
-    discharge = np.reshape(found.course.signals.discharge, (len(steps), -1))[last, 0]
-    has_charge = (conditions.battery > 0.5) & (steps[last] == number)
+    assert mission.course is not None  # it was asked for
+    cycles, segments = mission.status.shape
+    number = np.arange(cycles * segments)
+    time = np.ravel(mission.segments.time)
+    segment_of_step = np.where(
+        mission.course.segment < 0, len(number), mission.course.segment
+    )  # after the end, beyond the last
+    last_steps = np.maximum(np.searchsorted(segment_of_step, number, side="right") - 1, 0)
+    discharge = np.reshape(mission.course.signals.discharge, (len(segment_of_step), -1))[last_steps, 0]
+    has_charge = (conditions.battery > 0.5) & (segment_of_step[last_steps] == number)
     numbers["state_of_charge"] = np.where(has_charge, 1 - discharge / float(robot.battery.capacity), np.nan)
     rows = {
         "run_id": np.full(len(number), name),
@@ -208,71 +214,75 @@ def _segment_rows(
         "time_s": np.cumsum(time) - time,
         "mode": np.array(source.modes)[number % segments],
         **{c: np.ravel(numbers[c]) for c in mission_batch.mission_columns(source.turns) if c in numbers},
-        **outputs.status_words(found.status.ravel(), found.flags.ravel()),
+        **outputs.status_words(mission.status.ravel(), mission.flags.ravel()),
     }
     return {column: values[time > 0] for column, values in rows.items()}
 
 
 def select_course_rows(
-    segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None
+    segment: np.ndarray, current: np.ndarray, max_rows: int, is_marked: np.ndarray | None = None
 ) -> np.ndarray:
     """Rows of a course to keep, in order: the current peak of each segment, marked rows, and evenly spaced ones.
 
     Args:
         segment: index of the segment of each row, not decreasing.
         current: current of each row.
-        most: largest number of rows to keep.
-        marked: rows to keep. If there are too many, the last ones.
+        max_rows: largest number of rows to keep.
+        is_marked: rows to keep. If there are too many, the last ones.
     """
-    if len(segment) <= most:
+    if len(segment) <= max_rows:
         return np.arange(len(segment))
     firsts = np.flatnonzero(np.diff(segment, prepend=segment[0] - 1))
     ends = np.append(firsts[1:], len(segment))
     peaks = np.array([a + np.argmax(np.abs(current[a:b])) for a, b in zip(firsts, ends, strict=True)])
-    if len(peaks) > most // 2:  # if there are too many segments, those with the highest peaks
-        peaks = peaks[np.argsort(-np.abs(current[peaks]), kind="stable")[: most // 2]]
-    if marked is not None:
-        peaks = np.union1d(peaks, np.flatnonzero(marked)[-(most // 4) :])
-    spread = np.round(np.linspace(0, len(segment) - 1, most - len(peaks))).astype(int)
-    return np.unique(np.concatenate([peaks, spread]))
+    if len(peaks) > max_rows // 2:  # if there are too many segments, those with the highest peaks
+        peaks = peaks[np.argsort(-np.abs(current[peaks]), kind="stable")[: max_rows // 2]]
+    if is_marked is not None:
+        peaks = np.union1d(peaks, np.flatnonzero(is_marked)[-(max_rows // 4) :])
+    evenly_spaced = np.round(np.linspace(0, len(segment) - 1, max_rows - len(peaks))).astype(int)
+    return np.unique(np.concatenate([peaks, evenly_spaced]))
 
 
 def _course_rows(
-    robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, name: str, most: int
+    robot: Robot, conditions: Conditions, source: ProfileTable, mission: Mission, name: str, max_rows: int
 ) -> Columns:
     """Rows of history.csv for one run."""
-    assert found.course is not None  # it was asked for
-    is_step = found.course.segment >= 0
-    course = jax.tree.map(lambda x: x[is_step], found.course)
-    largest = np.abs(course.signals.current).reshape(len(course.segment), -1).max(1)  # both sides
-    picked = select_course_rows(course.segment, largest, most, course.event >= _LASTING)
-    course = jax.tree.map(lambda x: x[picked], course)
-    signals, of_sides = course.signals, {}
+    assert mission.course is not None  # it was asked for
+    is_step = mission.course.segment >= 0
+    course = jax.tree.map(lambda x: x[is_step], mission.course)
+    largest_current = np.abs(course.signals.current).reshape(len(course.segment), -1).max(1)  # both sides
+    kept_rows = select_course_rows(course.segment, largest_current, max_rows, course.event >= _FIRST_MARK_KEPT)
+    course = jax.tree.map(lambda x: x[kept_rows], course)
+    signals = course.signals
+    side_columns = {}
     winding, housing = course.temperature_winding, course.temperature_housing
     if source.turns:
-        reading, signals = balances.readings_of_sides(robot, signals), balances.mean_of_sides(signals)
-        of_sides = {c.column: np.asarray(reading[c.name]) / c.factor for c in channels.OF_TURNS}
-        for side, duty, hot in zip(channels.SIDES, course.signals.duty.T, winding.T, strict=True):
-            of_sides |= {f"duty_{side}": duty, f"winding_temperature_{side}_C": hot}
+        reading = balances.readings_of_sides(robot, signals)
+        signals = balances.mean_of_sides(signals)
+        side_columns = {c.column: np.asarray(reading[c.name]) / c.factor for c in channels.OF_TURNS}
+        for side, duty, temperature in zip(channels.SIDES, course.signals.duty.T, winding.T, strict=True):
+            side_columns |= {f"duty_{side}": duty, f"winding_temperature_{side}_C": temperature}
         winding, housing = winding.max(1), housing.max(1)
     else:
         reading = balances.sensor(robot, signals)
     # Demands act this much later than in the profile, as do the values written next to them.
     delay = float(robot.rig.delay)
     segment = course.segment % source.segment_count
-    length = np.ravel(found.segments.time)
+    length = np.ravel(mission.segments.time)
     elapsed = course.time - (np.cumsum(length) - length)[course.segment]
-    per_speed = float(robot.gearbox.ratio / robot.configurations.members[int(conditions.configuration)].radius)
+    motor_speed_per_speed = float(
+        robot.gearbox.ratio / robot.configurations.members[int(conditions.configuration)].radius
+    )
     state_of_charge = 1 - signals.discharge / float(robot.battery.capacity)
-    demanded = source.demanded(segment, elapsed, per_speed)
-    of_shaft = {}
+    demanded = source.demanded(segment, elapsed, motor_speed_per_speed)
+    shaft_columns = {}
     if not robot.has_ground:
-        of_shaft = {
+        shaft_columns = {
             "motor_speed_rpm": np.asarray(reading["motor_speed"]) / quantities.RPM,
-            "demanded_motor_speed_rpm": demanded * per_speed / quantities.RPM,
+            "demanded_motor_speed_rpm": demanded * motor_speed_per_speed / quantities.RPM,
         }
     return {
-        "run_id": np.full(len(picked), name),
+        "run_id": np.full(len(kept_rows), name),
         "time_s": course.time + delay,
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / quantities.MM,
@@ -282,7 +292,7 @@ def _course_rows(
         "voltage_V": signals.voltage,
         "traction_N": float(robot.sides) * signals.traction,
         "demanded_speed_mm_s": demanded / quantities.MM,
-        **of_shaft,
+        **shaft_columns,
         "duty": signals.duty,
         "source_voltage_V": signals.voltage_source,
         "motor_current_A": np.asarray(reading["motor_current"]),
@@ -294,6 +304,6 @@ def _course_rows(
         "state_of_charge": np.where(conditions.battery > 0.5, state_of_charge, np.nan),
         "cycle": course.segment // source.segment_count + 1,
         "segment": segment + 1,
-        **of_sides,
+        **side_columns,
         "event": np.array([*MARKS, ""])[course.event],
     }

@@ -34,9 +34,11 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     robot = load_robot(config).robot
     capabilities.check_on_ground(robot, "render")
     conditions = run.conditions_of_runs(robot, one_run(robot, picture.stated, config.battery), config)
-    run.check_runs_bearable(robot, conditions, config)
-    with scale.share_progress() as told:
-        trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
+    run.check_fidelity_options(robot, conditions, config)
+    with scale.share_progress() as report_share:
+        trajectory = track_batch(
+            robot, conditions, duration=options["duration"], step=options["step"], progress=report_share
+        )
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
     with replacing(file) as temporary, progress_bar(1, quiet=False, doing="drawing") as advance:

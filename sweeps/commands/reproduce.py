@@ -13,14 +13,14 @@ from sweeps.paper import data, report
 from sweeps.store import finish_run_folder, open_folder, print_report
 
 
-def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -> int:
+def execute(config: configuration.Reproduce, invocation: configuration.FolderPart) -> int:
     """Writes the paper's figures and tables for a robot to a run folder. Returns the exit code."""
     file = load_robot(config)
     robot = file.robot
     capabilities.check_on_ground(robot, "reproduce")
-    gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
-    with open_folder("reproduce", config, robot, beside, records.read_runs("measured")) as folder:
-        document, rows = report.paper_document(file, gear)
+    resolves_gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
+    with open_folder("reproduce", config, robot, invocation, records.read_runs("measured")) as folder:
+        document, rows = report.paper_document(file, resolves_gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:
             print_message(

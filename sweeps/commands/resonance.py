@@ -35,15 +35,15 @@ from sweeps.pages import words
 from sweeps.points import run, scale
 from sweeps.points.grid import grid_conditions
 from sweeps.report import resonance_report
-from sweeps.report.resonance_report import SLOW, ResonanceResult
+from sweeps.report.resonance_report import TOO_SLOW, ResonanceResult
 from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 CHUNK = 96  # runs per call
-FEWEST = 5  # fewest voltages for finding a peak
-SHORTEST = 0.5  # duration of a run [s]
+FEWEST_VOLTAGES = 5  # fewest voltages for finding a peak
+SHORTEST_RUN = 0.5  # duration of a run [s]
 
 
-def execute(config: configuration.Resonance, beside: configuration.FolderPart) -> int:
+def execute(config: configuration.Resonance, invocation: configuration.FolderPart) -> int:
     """Maps the ripple of a robot and writes a run folder. Returns the exit code: 0 if done, 3 if some runs did not
     settle, or slid, tipped or failed.
     """
@@ -59,32 +59,36 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
             "payloads_kg": tuple(sorted(set(config.payloads_kg))),
         }
     )
-    voltages, duration = config.voltages_V, config.options["duration"]
+    voltages = config.voltages_V
+    duration = config.options["duration"]
     if voltages[0] <= 0:
         raise BadConfiguration(f"--voltages: got {voltages[0]:g}; expected above 0 and up to 100, forward")
-    if len(voltages) < FEWEST:
+    if len(voltages) < FEWEST_VOLTAGES:
         values = count_noun(len(voltages), "value")
-        raise BadConfiguration(f"--voltages: got {values}; expected at least {FEWEST}, to find peaks over speed")
-    if duration < SHORTEST:
         raise BadConfiguration(
-            f"--duration: got {duration:g} s; expected at least {SHORTEST:g} s, so that grousers pass"
+            f"--voltages: got {values}; expected at least {FEWEST_VOLTAGES}, to find peaks over speed"
+        )
+    if duration < SHORTEST_RUN:
+        raise BadConfiguration(
+            f"--duration: got {duration:g} s; expected at least {SHORTEST_RUN:g} s, so that grousers pass"
         )
     runs = grid_conditions(_speed_grid(config, config.voltages_V), robot)
     conditions = run.conditions_of_runs(robot, runs, config)
-    run.check_runs_bearable(robot, conditions, config)
-    with open_folder("resonance", config, robot, beside, runs) as folder:
-        parts_words = passing_parts(robot, robot.configurations.names.index(name))
-        columns = _ripple_columns(folder, robot, conditions, config, parts_words)
+    run.check_fidelity_options(robot, conditions, config)
+    with open_folder("resonance", config, robot, invocation, runs) as folder:
+        passing = passing_parts(robot, robot.configurations.names.index(name))
+        columns = _ripple_columns(folder, robot, conditions, config, passing)
         table = {**run.condition_table(robot, runs), **columns}
-        result = _modes_and_peaks(config, robot, parts_words, table)
+        result = _modes_and_peaks(config, robot, passing, table)
         folder.write_table("points.csv", table)
-        rows = [{"payload_kg": p, **m._asdict()} for p, modes in result.modes.items() for m in modes]
+        rows = [{"payload_kg": peak, **mode._asdict()} for peak, modes in result.modes.items() for mode in modes]
         folder.write_table("modes.csv", _tuple_columns(rows, Mode))
-        folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in result.peaks], RipplePeak))
+        folder.write_table("peaks.csv", _tuple_columns([peak._asdict() for peak in result.peaks], RipplePeak))
         folder.write_json("result.json", result.to_json())
-        document = print_report(resonance_report.resonance_document(result, file), file)
-        manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
-        return finish_run_folder(folder, manifest, document, solved)
+        page = print_report(resonance_report.resonance_document(result, file), file)
+        manifest = {"seed": None, "statuses": result.statuses}
+        solved = words.every_run_solved(result.statuses)
+        return finish_run_folder(folder, manifest, page, solved)
 
 
 def _speed_grid(config: configuration.Resonance, voltages: tuple[float, ...]) -> GridPart:
@@ -99,37 +103,39 @@ def _speed_grid(config: configuration.Resonance, voltages: tuple[float, ...]) ->
 
 
 def _ripple_columns(
-    folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: PassingParts
+    folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, passing: PassingParts
 ) -> Columns:
     """Ripple columns, computed in chunks. Chunks stored by an interrupted run are not simulated again."""
-    total, parts = conditions.shape[0], []
-    size = min(CHUNK, total)
-    with progress_bar(total, quiet=False) as advance:
-        for first in range(0, total, size):
-            rows = np.minimum(np.arange(first, first + size), total - 1)
-            count, name = min(size, total - first), f"chunk-{first // size:06d}"
+    run_count = conditions.shape[0]
+    parts = []
+    size = min(CHUNK, run_count)
+    with progress_bar(run_count, quiet=False) as advance:
+        for first in range(0, run_count, size):
+            rows = np.minimum(np.arange(first, first + size), run_count - 1)
+            count = min(size, run_count - first)
+            name = f"chunk-{first // size:06d}"
             part = folder.chunk(name)
             if part is None:
-                counter = scale.share_counter(advance, count)
-                rows_conditions = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
+                report_share = scale.share_counter(advance, count)
+                chunk_conditions = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
                 options = {key: config.options[key] for key in ("duration", "step")}
-                track_runs = track_batch(robot, rows_conditions, rolling=True, progress=counter, **options)
-                part = {key: x[:count] for key, x in _ripple_of_batch(robot, track_runs, what).items()}
+                track_runs = track_batch(robot, chunk_conditions, rolling=True, progress=report_share, **options)
+                part = {key: x[:count] for key, x in _ripple_of_batch(robot, track_runs, passing).items()}
                 folder.keep_chunk(name, part)
-                counter(1.0)
+                report_share(1.0)
             else:
                 advance(count)
             parts.append(part)
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _ripple_of_batch(robot: Robot, ended: Any, what: PassingParts) -> Columns:
+def _ripple_of_batch(robot: Robot, track_runs: Any, passing: PassingParts) -> Columns:
     """Ripple of a batch of runs, in the units of the table."""
-    vibrations = vibrations_of_runs(robot, ended, what.pitch)
+    vibrations = vibrations_of_runs(robot, track_runs, passing.pitch)
     status = np.array(STATUSES)[vibrations.status]
-    slow = ~vibrations.read & np.isin(status, ("converged", "not_settled"))
+    is_too_slow = ~vibrations.read & np.isin(status, ("converged", "not_settled"))
     columns = {
-        "status": np.where(slow, SLOW, status),
+        "status": np.where(is_too_slow, TOO_SLOW, status),
         "passing_Hz": vibrations.passing,
     }
     for name, signal in SIGNALS.items():
@@ -142,29 +148,44 @@ def _ripple_of_batch(robot: Robot, ended: Any, what: PassingParts) -> Columns:
 
 
 def _modes_and_peaks(
-    config: configuration.Resonance, robot: Robot, what: PassingParts, table: Columns
+    config: configuration.Resonance, robot: Robot, passing: PassingParts, table: Columns
 ) -> ResonanceResult:
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
-    middle = _speed_grid(config, (config.voltages_V[len(config.voltages_V) // 2],))
-    linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle, robot), config))
-    by_payload = dict(zip(config.payloads_kg, linear, strict=True))
-    tops: list[RipplePeak] = []
-    ends: dict[float, tuple[float, float]] = {}
-    for payload, peaks in by_payload.items():
+    middle_grid = _speed_grid(config, (config.voltages_V[len(config.voltages_V) // 2],))
+    modes_of_payloads = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle_grid, robot), config))
+    by_payload = dict(zip(config.payloads_kg, modes_of_payloads, strict=True))
+    ripple_peaks: list[RipplePeak] = []
+    speed_range_of_payload: dict[float, tuple[float, float]] = {}
+    for payload, modes_here in by_payload.items():
         rows = np.flatnonzero((table["payload_kg"] == payload) & (table["status"] == "converged"))
         rows = rows[np.argsort(table["speed_mean_mm_s"][rows])]
         if not len(rows):
             continue
         speed = table["speed_mean_mm_s"][rows] * MM
         for name in SIGNALS:
-            ripple, frequency = table[f"{name}_ripple_percent"][rows] / 100, table[f"{name}_frequency_Hz"][rows]
-            tops += peaks_over_speed(name, payload, speed, table["passing_Hz"][rows], ripple, frequency, peaks)
-        ends[payload] = float(speed[0]), float(speed[-1])
-    tops = drop_unconfirmed_modes(tops, by_payload)
-    meets = [c for p, peaks in ends.items() for c in find_crossings(by_payload[p], p, what.travel, *peaks, tops)]
+            ripple = table[f"{name}_ripple_percent"][rows] / 100
+            frequency = table[f"{name}_frequency_Hz"][rows]
+            ripple_peaks += peaks_over_speed(
+                name, payload, speed, table["passing_Hz"][rows], ripple, frequency, modes_here
+            )
+        speed_range_of_payload[payload] = float(speed[0]), float(speed[-1])
+    ripple_peaks = drop_unconfirmed_modes(ripple_peaks, by_payload)
+    crossings = [
+        c
+        for payload_here, modes_here in speed_range_of_payload.items()
+        for c in find_crossings(by_payload[payload_here], payload_here, passing.travel, *modes_here, ripple_peaks)
+    ]
     return ResonanceResult(
-        config.configuration, config.slope_deg, config.surface, what, robot, table, by_payload, tops, meets
+        config.configuration,
+        config.slope_deg,
+        config.surface,
+        passing,
+        robot,
+        table,
+        by_payload,
+        ripple_peaks,
+        crossings,
     )
 
 

@@ -25,11 +25,11 @@ from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import print_message
 from sweeps.inputs import load_robot, posterior_beside_robot
-from sweeps.points import axes as axes_room
-from sweeps.points import grid as grid_room
+from sweeps.points import axes as sweep_axes
+from sweeps.points import grid as grids
 from sweeps.points.grid import grid_conditions, grid_configurations
-from sweeps.points.job import showing_turns
-from sweeps.points.run import check_runs_bearable
+from sweeps.points.job import robot_for_turns
+from sweeps.points.run import check_fidelity_options
 from sweeps.report import sensitivity_report
 from sweeps.store import finish_run_folder, open_folder, print_report
 
@@ -39,7 +39,7 @@ CORNERS = {
     "payloads_kg": (PAYLOADS_KG[0], PAYLOADS_KG[-1]),
     "slopes_deg": SLOPES_DEG[::2],
 }
-WHOLE = {"voltages_V": VOLTAGES_V, "payloads_kg": PAYLOADS_KG, "slopes_deg": SLOPES_DEG}
+TABLE_8 = {"voltages_V": VOLTAGES_V, "payloads_kg": PAYLOADS_KG, "slopes_deg": SLOPES_DEG}
 #: Condition that may vary → axis of operating points that it replaces.
 AXES = {
     "voltage": "voltages_V",
@@ -49,7 +49,7 @@ AXES = {
 }
 
 
-def execute(config: configuration.Sensitivity, beside: configuration.FolderPart) -> int:
+def execute(config: configuration.Sensitivity, invocation: configuration.FolderPart) -> int:
     """Runs a sensitivity study of a robot and writes a run folder. Returns the exit code: 0 if done, 3 if the solver
     failed at some operating points.
     """
@@ -68,29 +68,29 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
             raise BadConfiguration(
                 f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
             ) from None
-    freed = [name for name in ranges if name in OF_TURNS]
-    robot = showing_turns(file.robot, freed)
-    outputs = chosen_outputs(config.outputs, robot, bool(freed))
+    turn_conditions = [name for name in ranges if name in OF_TURNS]
+    robot = robot_for_turns(file.robot, turn_conditions)
+    outputs = chosen_outputs(config.outputs, robot, bool(turn_conditions))
     runs = _operating_points(config, robot, ranges)
     if config.posterior and config.parameters:
         raise BadConfiguration("--posterior: cannot be combined with --parameters; give one of them")
     if config.posterior:
         inputs = uncertain_inputs.inputs_from_posterior(file.robot, posterior_beside_robot(file), ranges)
     else:
-        present = tuple(dict.fromkeys(map(str, runs["configuration"])))
+        configurations = tuple(dict.fromkeys(map(str, runs["configuration"])))
         names = config.parameters or uncertain_inputs.default_input_names(
-            file.robot, present, config.battery, config.model, bool(freed)
+            file.robot, configurations, config.battery, config.model, bool(turn_conditions)
         )
         inputs = uncertain_inputs.inputs_from_priors(file.robot, names, ranges)
     conditions = runs.conditions(robot)
-    turn_columns: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
-    check_runs_bearable(robot, dataclasses.replace(conditions, **turn_columns), config)
+    turn_columns: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in turn_conditions}
+    check_fidelity_options(robot, dataclasses.replace(conditions, **turn_columns), config)
     study = Study(
         robot, inputs, OperatingPoints.of(runs), outputs, config.model, config.options,
         report_in_words(print_message), battery=float(config.battery),
         discharge=config.discharge_mAh * COULOMB_PER_MAH, adhesion=np.asarray(conditions.adhesion),
     )  # fmt: skip
-    with open_folder("sensitivity", config, file.robot, beside, runs) as folder:
+    with open_folder("sensitivity", config, file.robot, invocation, runs) as folder:
         result = analyse_sensitivity(study, config.method, config.evaluations, config.seed)
         folder.write_json("result.json", result.to_json())
         for name, table in result.tables().items():
@@ -107,16 +107,19 @@ def _operating_points(
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
         raise BadConfiguration("sensitivity: this robot imposes the motor current; use simulate or sweep")
-    usual_axes: dict[str, tuple[float, ...]] = {}
+    default_axes: dict[str, tuple[float, ...]] = {}
     if layout.complete:
-        usual_axes = CORNERS if config.method in ("sobol", "morris") else WHOLE
+        default_axes = CORNERS if config.method in ("sobol", "morris") else TABLE_8
         if not set(OF_TURNS).isdisjoint(ranges):  # which settle only on level ground
-            usual_axes = {**usual_axes, "slopes_deg": (0.0,)}
-    axes = {key: getattr(config, key) or usual_axes.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
+            default_axes = {**default_axes, "slopes_deg": (0.0,)}
+    axes = {key: getattr(config, key) or default_axes.get(key) for key in (*TABLE_8, "motor_speeds_rpm")}
     for name, (low, high) in ranges.items():
-        ground, shaft = ([f"--vary {name}"] * (name in own) for own in (axes_room.ON_GROUND, axes_room.ON_SHAFT))
+        ground, shaft = (
+            [f"--vary {name}"] * (name in acting_names)
+            for acting_names in (sweep_axes.ON_GROUND, sweep_axes.ON_SHAFT)
+        )
         capabilities.check_acting(robot, ground, shaft)
-        if name in grid_room.AXIS and name != layout.imposed:
+        if name in grids.AXIS and name != layout.imposed:
             raise BadConfiguration(
                 f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
             )
@@ -132,7 +135,7 @@ def _operating_points(
     except ValueError:
         raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range exceeds the limits of a run") from None
     notes: list[str] = []
-    grid = grid_room.resolve_grid(grid, robot, config.battery, notes)
+    grid = grids.resolve_grid(grid, robot, config.battery, notes)
     for note in notes:
         print_message(note)
     names = grid_configurations(grid, robot)

@@ -18,26 +18,26 @@ from sweeps.report import settle_report
 from sweeps.store import finish_run_folder, open_folder, print_report
 
 
-def execute(config: configuration.Settle, beside: configuration.SettledLog) -> int:
+def execute(config: configuration.Settle, invocation: configuration.SettledLog) -> int:
     """Finds the settled runs in a log and writes a run folder with their table. Returns the exit code, 0."""
     robot = load_robot(config).robot
-    runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
+    runs = read_runs(invocation.data, robot, columns=config.columns, measured=True, series=True)
     column_options = [] if config.columns is None else ["--columns", config.columns]
-    loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *column_options])
+    loop_command = shlex.join(["mmrjax", "loop", invocation.data, "--robot", config.robot, *column_options])
     settled = settling.settle_log(runs, robot, shortest=config.shortest_s, drift=config.drift)
-    few_runs_sentence = table_words.sentence_on_few_settled_runs(settled, SettledRuns.fewest, loop)
-    with open_folder("settle", config, robot, beside, runs) as folder:
+    few_runs_sentence = table_words.sentence_on_few_settled_runs(settled, SettledRuns.fewest, loop_command)
+    with open_folder("settle", config, robot, invocation, runs) as folder:
         folder.write_table("settled.csv", settled.table())
         folder.write_table("stretches.csv", segments_table(settled))
         folder.write_json("result.json", to_json(settled, few_runs_sentence))
         sign_sentences = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
-        document = print_report(settle_report.settle_document(settled, few_runs_sentence, sign_sentences))
-        return finish_run_folder(folder, {"seed": None, "settled": len(settled.kept)}, document)
+        page = print_report(settle_report.settle_document(settled, few_runs_sentence, sign_sentences))
+        return finish_run_folder(folder, {"seed": None, "settled": len(settled.kept)}, page)
 
 
-def segments_table(found: Settled) -> Columns:
+def segments_table(settled: Settled) -> Columns:
     """Table with a row for each segment of a log: position, reason if omitted, means, their sds, and changes."""
-    stretches = found.stretches
+    stretches = settled.stretches
     table: Columns = {
         "run_id": np.array([s.run for s in stretches]),
         "from_s": np.array([s.begin for s in stretches]),
@@ -47,7 +47,7 @@ def segments_table(found: Settled) -> Columns:
         "imposed": np.array([s.imposed for s in stretches]),
         "left_out": np.array([s.reason if s.why else "" for s in stretches]),
     }
-    for signal in found.signals:
+    for signal in settled.signals:
         channel = signal.channel
         fields = {
             channel.column: "mean",
@@ -55,25 +55,26 @@ def segments_table(found: Settled) -> Columns:
             channel.sd_column.replace("_sd_", "_change_"): "drift",
         }
         for column, field in fields.items():
-            table[column] = np.array([getattr(s, field).get(channel.name, np.nan) for s in stretches])
+            table[column] = np.array([getattr(stretch, field).get(channel.name, np.nan) for stretch in stretches])
     return table
 
 
-def to_json(found: Settled, few: str = "") -> Json:
-    """`result.json`. `few` is the sentence of `words.sentence_on_few_settled_runs`."""
-    omitted = table_words.omitted_stretches(found.stretches, bool(few) and not found.runs.turns)
+def to_json(settled: Settled, few_runs_sentence: str = "") -> Json:
+    """`result.json`. `few_runs_sentence` is the sentence of `words.sentence_on_few_settled_runs`."""
+    omitted = table_words.omitted_stretches(settled.stretches, bool(few_runs_sentence) and not settled.runs.turns)
     return {
         "schema": "mmrjax.settle/1",
-        "statement": table_words.settle_statement(found),
-        "samples": len(found.runs),
-        "settled": len(found.kept),
-        "shortest_s": found.shortest,
-        "drift": found.drift,
-        "gaps": len(found.gaps),
-        "scatter": dict(found.scatter),
+        "statement": table_words.settle_statement(settled),
+        "samples": len(settled.runs),
+        "settled": len(settled.kept),
+        "shortest_s": settled.shortest,
+        "drift": settled.drift,
+        "gaps": len(settled.gaps),
+        "scatter": dict(settled.scatter),
         "glitches": {
-            s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
+            signal.channel.name: sum(run.glitches.get(signal.channel.name, 0) for run in settled.kept)
+            for signal in settled.signals
         },
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in omitted],
-        "notes": [*filter(None, [few]), *table_words.settle_remarks(found)],
+        "notes": [*filter(None, [few_runs_sentence]), *table_words.settle_remarks(settled)],
     }

@@ -42,64 +42,72 @@ def draw_errors_over_conditions(table: Columns, channels: Sequence[Channel]) -> 
     conditions = {axis_title(c): table[c] for c in imposed if np.unique(table[c]).size > 1}
     conditions = conditions or {"row": np.arange(1.0, len(table["configuration"]) + 1)}
     fig, grid = new_figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
-    look = configuration_looks(table["configuration"])
-    for row, channel in zip(grid, channels, strict=True):
+    looks = configuration_looks(table["configuration"])
+    for panels_of_channel, channel in zip(grid, channels, strict=True):
         error = table[f"simulated_{channel.column}"] - table[channel.column]
         sd = table.get(channel.sd_column, np.array([np.nan]))
-        half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
-        for axes, (label, x) in zip(row, conditions.items(), strict=True):
-            axes.axhspan(-half, half, color="#eef3ee", zorder=0)
+        half_band = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
+        for axes, (label, x) in zip(panels_of_channel, conditions.items(), strict=True):
+            axes.axhspan(-half_band, half_band, color="#eef3ee", zorder=0)
             axes.axhline(0, color="#666666", lw=0.9)
-            shifts = 0.012 * np.ptp(x) * (np.linspace(-1, 1, len(look)) if len(look) > 1 else np.zeros(1))
-            for shift, (kind, (colour, marker)) in zip(shifts, look.items(), strict=True):
-                pick = (table["configuration"] == kind) & np.isfinite(error)
-                if pick.any():
-                    axes.plot(x[pick] + shift, error[pick], marker, ms=5, mec="white", mew=0.5, color=colour,
-                              label=kind, rasterized=np.count_nonzero(pick) > 500)  # fmt: skip
-            if row[0] is grid[-1, 0]:
+            shifts = 0.012 * np.ptp(x) * (np.linspace(-1, 1, len(looks)) if len(looks) > 1 else np.zeros(1))
+            for shift, (configuration, (colour, marker)) in zip(shifts, looks.items(), strict=True):
+                rows = (table["configuration"] == configuration) & np.isfinite(error)
+                if rows.any():
+                    axes.plot(x[rows] + shift, error[rows], marker, ms=5, mec="white", mew=0.5, color=colour,
+                              label=configuration, rasterized=np.count_nonzero(rows) > 500)  # fmt: skip
+            if panels_of_channel[0] is grid[-1, 0]:
                 axes.set_xlabel(label)
                 if np.unique(x).size <= 8:
                     axes.set_xticks(np.unique(x))
-        row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit}]")
-    if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
+        panels_of_channel[0].set_ylabel(f"{channel.label}\nerror [{channel.unit}]")
+    if grid[0, 0].get_legend_handles_labels()[0] and len(looks) <= LOOKS:
         grid[0, 0].legend(loc="best")
     return fig
 
 
-def quasistatic(found: Feedforward) -> Figure:
+def quasistatic(fit: Feedforward) -> Figure:
     """Voltage minus kA·a over velocity, for windows of the quasistatic tests."""
-    w, k = found.windows, found.constants
-    slow = w["quasistatic"] if w["quasistatic"].any() else np.ones(len(w["velocity"]), bool)
-    voltage = w["voltage_V"] - k["kA"] * w["acceleration"]
-    fig, axes = _points(w["velocity"][slow], voltage[slow], f"velocity [{found.unit}/s]", "V - kA·a [V]")
+    windows, constants = fit.windows, fit.constants
+    is_quasistatic = (
+        windows["quasistatic"] if windows["quasistatic"].any() else np.ones(len(windows["velocity"]), bool)
+    )
+    voltage = windows["voltage_V"] - constants["kA"] * windows["acceleration"]
+    fig, axes = _points(
+        windows["velocity"][is_quasistatic], voltage[is_quasistatic], f"velocity [{fit.unit}/s]", "V - kA·a [V]"
+    )
     for sign in (-1, 1):
-        v = w["velocity"][slow & (w["direction"] * sign > 0)]
-        if len(v):
-            ends = np.array([0.0, v[np.argmax(np.abs(v))]])
-            axes.plot(ends, k["kV"] * ends + sign * k["kS"] + k.get("kG", 0.0), color=ORANGE)
+        velocity = windows["velocity"][is_quasistatic & (windows["direction"] * sign > 0)]
+        if len(velocity):
+            ends = np.array([0.0, velocity[np.argmax(np.abs(velocity))]])
+            axes.plot(ends, constants["kV"] * ends + sign * constants["kS"] + constants.get("kG", 0.0), color=ORANGE)
     return fig
 
 
-def dynamic(found: Feedforward) -> Figure:
+def dynamic(fit: Feedforward) -> Figure:
     """Voltage minus kS and kV·v over acceleration."""
-    w, k = found.windows, found.constants
-    voltage = w["voltage_V"] - k["kV"] * w["velocity"] - k["kS"] * w["direction"]
-    a = w["acceleration"]
-    fig, axes = _points(a, voltage, f"acceleration [{found.unit}/s²]", "V - kS - kV·v [V]")
-    ends = np.array([a.min(), a.max()])
-    axes.plot(ends, k["kA"] * ends + (k.get("kG", 0.0) if found.mechanism == "elevator" else 0.0), color=ORANGE)
+    windows, constants = fit.windows, fit.constants
+    voltage = windows["voltage_V"] - constants["kV"] * windows["velocity"] - constants["kS"] * windows["direction"]
+    acceleration = windows["acceleration"]
+    fig, axes = _points(acceleration, voltage, f"acceleration [{fit.unit}/s²]", "V - kS - kV·v [V]")
+    ends = np.array([acceleration.min(), acceleration.max()])
+    axes.plot(
+        ends,
+        constants["kA"] * ends + (constants.get("kG", 0.0) if fit.mechanism == "elevator" else 0.0),
+        color=ORANGE,
+    )
     return fig
 
 
-def _points(x: np.ndarray, y: np.ndarray, along: str, up: str) -> tuple[Figure, Axes]:
+def _points(x: np.ndarray, y: np.ndarray, x_label: str, y_label: str) -> tuple[Figure, Axes]:
     fig, ((axes,),) = new_figure(1, 1, 3.2)
     axes.axhline(0, color=INK, lw=0.6)
     axes.plot(x, y, ".", ms=4, color=BLUE)
-    axes.set(xlabel=along, ylabel=up)
+    axes.set(xlabel=x_label, ylabel=y_label)
     return fig, axes
 
 
-#: Readings on a page, shared by all its runs and channels; a page stays below 1.5 MB.
+#: Number of readings on a page, for all runs and channels together, so that a page is smaller than 1.5 MB.
 POINTS = 24_000
 COLOURS = (BLUE, ORANGE)
 
@@ -139,7 +147,8 @@ class TimeOverlay:
 
     def draw(self) -> Figure:
         """Figure of the worst run: for each channel the readings, and below them simulated minus measured."""
-        name, count = self.worst, len(self.channels)
+        name = self.worst
+        count = len(self.channels)
         rows = self._thinned(self.rows[name], POINTS // (4 * count))
         time = self.table["time_s"][rows]
         fig, grid = new_figure(2 * count, 1, 2.9 * count, sharex=True, height_ratios=[3, 1] * count)
@@ -160,12 +169,14 @@ class TimeOverlay:
     def to_json(self) -> str:
         """Data of the interactive figure: for each run its times and, by channel, measured and simulated readings."""
         curves = len(self.channels) * (1 + len(self.simulated))
-        most, spent, worst = max(200, POINTS // (len(self.rows) * curves)), 0, self.worst
+        rows_per_run = max(200, POINTS // (len(self.rows) * curves))
+        points_so_far = 0
+        worst = self.worst
         runs: Json = {}
         for name in sorted(self.rows, key=lambda name: name != worst):
-            rows = self._thinned(self.rows[name], most)
-            spent += len(rows) * curves
-            if runs and spent > 2 * POINTS:
+            rows = self._thinned(self.rows[name], rows_per_run)
+            points_so_far += len(rows) * curves
+            if runs and points_so_far > 2 * POINTS:
                 break
             runs[name] = {
                 "time": _numbers(self.table["time_s"][rows]),
@@ -174,19 +185,19 @@ class TimeOverlay:
                     for c in self.channels
                 ],
             }
-        about: Json = {
+        data: Json = {
             "labels": ["measured", *self.simulated.values()],
             "channels": [{"label": c.label, "unit": c.unit} for c in self.channels],
             "runs": runs,
         }
-        return json.dumps(about, separators=(",", ":")).replace("<", "\\u003c")
+        return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
 
-    def _thinned(self, rows: np.ndarray, most: int) -> np.ndarray:
-        """Up to about `most` rows in order: of each group the rows of the extreme readings of every channel."""
-        if len(rows) <= most:
+    def _thinned(self, rows: np.ndarray, max_rows: int) -> np.ndarray:
+        """Up to about `max_rows` rows in order: of each group the rows of the extreme readings of every channel."""
+        if len(rows) <= max_rows:
             return rows
         kept_rows = {0, len(rows) - 1}
-        for part in np.array_split(np.arange(len(rows)), max(1, most // (2 * len(self.channels)))):
+        for part in np.array_split(np.arange(len(rows)), max(1, max_rows // (2 * len(self.channels)))):
             for channel in self.channels:
                 readings = self.table[channel.column][rows[part]]
                 if np.isfinite(readings).any():

@@ -23,7 +23,7 @@ from mmrjax.model.channels import Channel
 
 WIDTH = 10.0  # inches, the width of the page's text
 INK, FAINT = "#222222", "#8a8a8a"
-# Okabe and Ito (2008), without yellow, which is hard to see on white paper.
+# Palette of Okabe and Ito (2008) without yellow, which is hard to see on white paper.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
 _CYCLE = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANGE, "v"), (SKY, "P"))
 #: Number of different styles. More configurations would share them, and a legend could not distinguish them.

@@ -40,32 +40,37 @@ from sweeps.pages.figure_style import (
 from sweeps.report.run_tables import axis_title, quantity_column
 
 #: Samples per segment of a frequency response, and smallest coherence of drawn points.
-SEGMENT, COHERENT = 256, 0.7
+SEGMENT, MIN_COHERENCE = 256, 0.7
 #: Fewest rows of a run for a frequency response.
-SHORTEST = 32
+FEWEST_ROWS = 32
 
 
-def draw_settled_log(found: Settled) -> Figure:
+def draw_settled_log(settled_log: Settled) -> Figure:
     """The imposed quantity and each channel over the log, with settled stretches and their means."""
-    runs, clock, begin = found.runs, np.zeros(len(found.runs)), 0.0
+    runs = settled_log.runs
+    clock = np.zeros(len(settled_log.runs))
+    begin = 0.0
     for rows in runs.rows_by_run().values():  # recordings one after the other
         clock[rows] = begin + runs["time_s"][rows] - runs["time_s"][rows[0]]
         begin = float(clock[rows[-1]])
     order = np.argsort(clock, kind="stable")
     lines = [(axis_title(runs.layout.imposed_column).replace(" [", "\n["), applied_drive(runs))]
     lines += [
-        (f"{s.channel.label}\n[{s.channel.unit}]", s.shown if len(s.angle) else runs[s.channel.column])
-        for s in found.signals
+        (
+            f"{signal.channel.label}\n[{signal.channel.unit}]",
+            signal.shown if len(signal.angle) else runs[signal.channel.column],
+        )
+        for signal in settled_log.signals
     ]
     fig, grid = new_figure(len(lines), 1, 1.9 * len(lines), sharex=True)
-    for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
+    for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *settled_log.signals), strict=True):
         axes.plot(clock[order], values[order], color=FAINT, lw=0.8, rasterized=len(order) > 3000)
-        for s in found.stretches:
-            if s.why:
+        for stretch in settled_log.stretches:
+            if stretch.why:
                 continue
-            ends = clock[s.rows[[0, -1]]]
+            ends = clock[stretch.rows[[0, -1]]]
             axes.axvspan(*ends, color="#e3eef7", lw=0, zorder=0)
-            mean = s.imposed if signal is None else s.mean[signal.channel.name]
+            mean = stretch.imposed if signal is None else stretch.mean[signal.channel.name]
             axes.plot(ends, (mean, mean), color=BLUE if signal is None else VERMILION, lw=2)
         axes.set_ylabel(label)
     grid[-1, 0].set_xlabel("time [s], recordings one after the other")
@@ -111,83 +116,88 @@ class StartRun:
         return float(np.sign(self.current[size.argmax()]) * curve_peak(jnp.asarray(self.time), jnp.asarray(size)))
 
     @property
-    def ended(self) -> tuple[float, float]:
+    def end_values(self) -> tuple[float, float]:
         """Current [A] and speed [mm/s] at the end, as means over the last 0.15 s because of ripple."""
         last_instants = last_samples(self.time)
         return float(self.current[last_instants].mean()), float(self.speed[last_instants].mean())
 
 
 def start_runs(
-    robot: Robot, history: Any, status: np.ndarray, which: Sequence[int], names: Sequence[str]
+    robot: Robot, history: Any, status: np.ndarray, configuration_indices: Sequence[int], names: Sequence[str]
 ) -> list[StartRun]:
     """Members of a batch of runs from standstill, of any fidelity that has histories.
 
     Args:
         history: time and signals of the batch.
         status: codes of how its members ended.
-        which: index of each member's configuration in `robot`.
+        configuration_indices: index of each member's configuration in `robot`.
         names: headings of the members.
     """
-    answer, signals = [], history.signals
+    starts = []
+    signals = history.signals
     for k, (name, stages) in enumerate(
-        zip(names, stages_of_histories(robot, history, which[: len(names)]), strict=True)
+        zip(names, stages_of_histories(robot, history, configuration_indices[: len(names)]), strict=True)
     ):
-        stages, upto = stages or _NO_STAGES, count_finite_samples(np.asarray(signals.total_current[k]))
+        stages = stages or _NO_STAGES
+        sample_count = count_finite_samples(np.asarray(signals.total_current[k]))
         time, current, speed, theoretical = (
-            np.asarray(x[k])[:upto]
+            np.asarray(x[k])[:sample_count]
             for x in (history.time, signals.total_current, signals.speed, signals.speed_theoretical)
         )
         scale = stages.sense / MM
-        answer.append(
+        starts.append(
             StartRun(
-                name, robot.configurations.names[int(which[k])], STATUSES[int(status[k])], stages, time,
-                stages.sense * current, scale * speed, scale * theoretical,
+                name, robot.configurations.names[int(configuration_indices[k])], STATUSES[int(status[k])], stages,
+                time, stages.sense * current, scale * speed, scale * theoretical,
             )
         )  # fmt: skip
-    return answer
+    return starts
 
 
-def draw_starts(shown: list[StartRun], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
+def draw_starts(starts: list[StartRun], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
     """One row for each run: inrush enlarged, total current, V and shaft speed, with the stages shaded.
 
     For a run that ends backward, backward is drawn positive.
     """
-    fig, grid = new_figure(len(shown), 3, 3.1 * len(shown), width_ratios=[0.85, 1.2, 1.35])
-    look = configuration_looks(start.configuration for start in shown)
-    for (zoom, current, speed), start in zip(grid, shown, strict=True):
-        zoom.set_title(f"{start.name}\nfirst {1e3 * INRUSH:.0f} ms")
+    fig, grid = new_figure(len(starts), 3, 3.1 * len(starts), width_ratios=[0.85, 1.2, 1.35])
+    looks = configuration_looks(start.configuration for start in starts)
+    for (inrush_axes, current_axes, speed_axes), start in zip(grid, starts, strict=True):
+        inrush_axes.set_title(f"{start.name}\nfirst {1e3 * INRUSH:.0f} ms")
         backward = ", backward positive" if start.stages.sense < 0 else ""
-        current.set_title(current_title + backward)
-        speed.set_title(speed_title + backward)
+        current_axes.set_title(current_title + backward)
+        speed_axes.set_title(speed_title + backward)
         if not start.time.size:
-            add_corner_note(zoom, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
+            add_corner_note(inrush_axes, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
-        colour = look[start.configuration][0]
-        _draw_inrush(zoom, start, colour)
-        _draw_current(current, start, colour)
-        _draw_speeds(speed, start, colour)
-        for axes, scale in ((zoom, 1e3), (current, 1.0), (speed, 1.0)):
+        colour = looks[start.configuration][0]
+        _draw_inrush(inrush_axes, start, colour)
+        _draw_current(current_axes, start, colour)
+        _draw_speeds(speed_axes, start, colour)
+        for axes, scale in ((inrush_axes, 1e3), (current_axes, 1.0), (speed_axes, 1.0)):
             _shade_stages(axes, start, scale)
     return fig
 
 
 def _draw_inrush(axes: Axes, start: StartRun, colour: str) -> None:
-    early, peak = start.time <= INRUSH, int(np.argmax(start.current))
+    early = start.time <= INRUSH
+    peak = int(np.argmax(start.current))
     current = start.current[early]
     axes.plot(1e3 * start.time[early], current, color=colour)
     axes.set(xlim=(0, 1e3 * INRUSH), ylim=(min(0.0, 1.1 * current.min()), 1.3 * max(current.max(), 1e-3)))
     axes.set(xlabel="time [ms]", ylabel="total current [A]")
     if early[peak]:
-        time, largest = 1e3 * start.time[peak], start.current[peak]
+        time = 1e3 * start.time[peak]
+        largest = start.current[peak]
         axes.plot(time, largest, "o", ms=5, color=colour)
         axes.annotate(f"peak {largest:.3g} A\nat {time:.1f} ms", (time, largest), xytext=(8, -2),
                       textcoords="offset points", va="top")  # fmt: skip
 
 
 def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
-    peak, run = float(start.current.max()), start.current[start.time > start.stages.starting]
-    run = run[len(run) // 20 :] if len(run) > 20 else start.current
-    top = max(1.75 * float(run.max()), 0.1)
+    peak = float(start.current.max())
+    later_current = start.current[start.time > start.stages.starting]
+    later_current = later_current[len(later_current) // 20 :] if len(later_current) > 20 else start.current
+    top = max(1.75 * float(later_current.max()), 0.1)
     axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
     low = min(0.0, 1.1 * float(start.current.min()))
     axes.set(xlim=(0, start.time[-1]), ylim=(low, top if peak > top else 1.3 * max(peak, 1e-3)))
@@ -197,13 +207,14 @@ def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
 
 
 def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
-    top, settled = max(float(start.theoretical.max()), 1.0), start.stages.settled
+    top = max(float(start.theoretical.max()), 1.0)
+    settled_time = start.stages.settled
     axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4, label=r"$V_{x\,teor}$ (shafts)")
     axes.plot(start.time, start.speed, color=colour, label="$V_x$ (robot)")
     axes.set(xlim=(0, start.time[-1]), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top))
     axes.set(xlabel="time [s]", ylabel="speed [mm/s]")
-    if 0 < settled < start.time[-1] and start.gets_under_way:
-        axes.axvline(settled, color=FAINT, lw=0.9, ls=":", label=f"t' = {settled:.2f} s")
+    if 0 < settled_time < start.time[-1] and start.gets_under_way:
+        axes.axvline(settled_time, color=FAINT, lw=0.9, ls=":", label=f"t' = {settled_time:.2f} s")
     axes.legend(loc="lower right")
     if start.status not in words.SETTLED:
         add_corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
@@ -221,17 +232,17 @@ def _shade_stages(axes: Axes, start: StartRun, scale: float) -> None:
 
 
 def draw_readings_over_time(
-    read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]
+    channels: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]
 ) -> Figure:
     """Readings of runs on a shaft over time: one row for each run, one panel for each channel.
 
     Args:
-        read: channels of the robot.
+        channels: channels of the robot.
         history: history of the batch.
         status: codes of how its members ended.
         names: headings of the members.
     """
-    over_time = [c for c in read if c.over_time]
+    over_time = [c for c in channels if c.over_time]
     fig, grid = new_figure(len(names), len(over_time), 2.6 * len(names))
     for k, (row, name) in enumerate(zip(grid, names, strict=True)):
         row[0].set_title(name)
@@ -264,50 +275,55 @@ def frequency_response(
     length = min(SEGMENT, *(int(np.ptp(time) / time_step) + 1 for time, _, _ in runs))
     spectra: Any = 0.0
     for time, drive, readings in runs:
-        even = time[0] + time_step * np.arange(int(np.ptp(time) / time_step) + 1)
-        resampled_drive = drive[np.searchsorted(time, even + 1e-3 * time_step, side="right") - 1]
-        series = np.stack([resampled_drive, *(np.interp(even, time, reading) for reading in readings)])
+        even_times = time[0] + time_step * np.arange(int(np.ptp(time) / time_step) + 1)
+        resampled_drive = drive[np.searchsorted(time, even_times + 1e-3 * time_step, side="right") - 1]
+        series = np.stack([resampled_drive, *(np.interp(even_times, time, reading) for reading in readings)])
         frequency, cross = signal.csd(resampled_drive, series, 1 / time_step, nperseg=length)
         _, power = signal.welch(series, 1 / time_step, nperseg=length)
-        spectra = spectra + len(even) * np.stack([cross, power + 0j])
-    cross, power = spectra[0, 1:, 1:], spectra[1, :, 1:].real
+        spectra = spectra + len(even_times) * np.stack([cross, power + 0j])
+    cross = spectra[0, 1:, 1:]
+    power = spectra[1, :, 1:].real
     coherence = np.abs(cross) ** 2 / np.maximum(power[0] * power[1:], 1e-300)
     return frequency[1:-1], (cross / np.maximum(power[0], 1e-300))[:, :-1], coherence[:, :-1]
 
 
-def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapping[str, str]) -> Figure:
+def draw_frequency_response(runs: Runs, channels: Sequence[Channel], simulated: Mapping[str, str]) -> Figure:
     """Gain and phase of each channel over frequency: measured as points, simulated as lines.
 
     Args:
         runs: runs with measured and simulated columns.
-        read: channels.
+        channels: channels.
         simulated: prefixes of the simulated columns, and their names.
     """
-    table, drive, rows = runs.columns, applied_drive(runs), runs.rows_by_run().values()
+    table = runs.columns
+    drive = applied_drive(runs)
+    rows = runs.rows_by_run().values()
     unit = quantity_column(runs.layout.imposed_column).unit
-    fig, grid = new_figure(2, len(read), 4.4, sharex=True)
-    for (gain, phase), channel in zip(grid.T, read, strict=True):
+    fig, grid = new_figure(2, len(channels), 4.4, sharex=True)
+    for (gain_axes, phase_axes), channel in zip(grid.T, channels, strict=True):
         columns = [channel.column, *(prefix + channel.column for prefix in simulated)]
-        finite = [r[np.all([np.isfinite(table[c][r]) for c in columns], axis=0)] for r in rows]
+        finite_rows = [
+            run_rows[np.all([np.isfinite(table[c][run_rows]) for c in columns], axis=0)] for run_rows in rows
+        ]
         series = [
-            (table["time_s"][r], drive[r], np.stack([table[c][r] for c in columns]))
-            for r in finite
-            if len(r) >= SHORTEST
+            (table["time_s"][run_rows], drive[run_rows], np.stack([table[c][run_rows] for c in columns]))
+            for run_rows in finite_rows
+            if len(run_rows) >= FEWEST_ROWS
         ]
         if not series:
-            add_corner_note(gain, "no run is long enough")
+            add_corner_note(gain_axes, "no run is long enough")
             continue
         frequency, response, coherence = frequency_response(series)
         looks = zip(response, coherence, ("measured", *simulated.values()), (INK, BLUE, ORANGE), strict=False)
         for values, coherent, label, colour in looks:
-            drawn = np.where(coherent > COHERENT, values, np.nan)
+            drawn = np.where(coherent > MIN_COHERENCE, values, np.nan)
             style = {"ls": "none", "marker": "o", "ms": 3} if label == "measured" else {"lw": 1.5}
-            gain.loglog(frequency, np.abs(drawn), color=colour, label=label, **style)
+            gain_axes.loglog(frequency, np.abs(drawn), color=colour, label=label, **style)
             angle = np.degrees(np.angle(drawn))
             if label != "measured":
                 angle[1:][np.abs(np.diff(angle)) > 180] = np.nan  # no line from -180° to 180°
-            phase.semilogx(frequency, angle, color=colour, **style)
-        gain.set(title=channel.label, ylabel=f"gain [{channel.unit}/{unit}]")
-        phase.set(xlabel="frequency [Hz]", ylabel="phase [°]", ylim=(-190, 190), yticks=[-180, -90, 0, 90, 180])
+            phase_axes.semilogx(frequency, angle, color=colour, **style)
+        gain_axes.set(title=channel.label, ylabel=f"gain [{channel.unit}/{unit}]")
+        phase_axes.set(xlabel="frequency [Hz]", ylabel="phase [°]", ylim=(-190, 190), yticks=[-180, -90, 0, 90, 180])
     grid[0, 0].legend(loc="best")
     return fig

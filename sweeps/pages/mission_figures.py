@@ -1,4 +1,4 @@
-"""Figures of missions and turns: readings over time, both sides, the path, and what other turns take."""
+"""Figures of missions and turns: readings over time, both sides, the path, and current and power of other turns."""
 
 from __future__ import annotations
 
@@ -43,18 +43,20 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
     """
     spans = {"the mission": float(rows["time_s"][-1])} | ({} if cycle is None else {"its first cycle": cycle})
     fig, grid = new_figure(4, len(spans), 9.6, width_ratios=[1.5, 1.0][: len(spans)], sharex="col")
-    for (speed, current, heat, source), (title, span) in zip(grid.T, spans.items(), strict=True):
-        size, unit = _time_unit(span)
+    for (speed_axes, current_axes, temperature_axes, source_axes), (title, span) in zip(
+        grid.T, spans.items(), strict=True
+    ):
+        unit_seconds, unit = _time_unit(span)
         shown_rows = {key: value[rows["time_s"] <= span] for key, value in rows.items()}
-        time = shown_rows["time_s"] / size
-        speed.set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
-        _draw_speed(speed, time, shown_rows, linear)
-        current.set_title(f"current of all motors, and duty{', sizes' if 'duty_left' in rows else ''}")
-        _draw_current(current, time, shown_rows, sides)
-        heat.set_title("temperatures")
-        _draw_temperatures(heat, time, shown_rows, limit)
-        _draw_source(source, time, shown_rows)
-        source.set(xlabel=f"time [{unit}]", xlim=(0, span / size))
+        time = shown_rows["time_s"] / unit_seconds
+        speed_axes.set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
+        _draw_speed(speed_axes, time, shown_rows, linear)
+        current_axes.set_title(f"current of all motors, and duty{', sizes' if 'duty_left' in rows else ''}")
+        _draw_current(current_axes, time, shown_rows, sides)
+        temperature_axes.set_title("temperatures")
+        _draw_temperatures(temperature_axes, time, shown_rows, limit)
+        _draw_source(source_axes, time, shown_rows)
+        source_axes.set(xlabel=f"time [{unit}]", xlim=(0, span / unit_seconds))
     return fig
 
 
@@ -64,35 +66,35 @@ def draw_sides(rows: Columns) -> Figure:
     Args:
         rows: rows of history.csv of one run with sides.
     """
-    fig, ((current,), (drive,), (turn,)) = new_figure(3, 1, 6.4, sharex=True)
-    size, unit = _time_unit(float(rows["time_s"][-1]))
-    time = rows["time_s"] / size
+    fig, ((current_axes,), (drive_axes,), (yaw_axes,)) = new_figure(3, 1, 6.4, sharex=True)
+    unit_seconds, unit = _time_unit(float(rows["time_s"][-1]))
+    time = rows["time_s"] / unit_seconds
     column, factor, label = ("duty_{}", 100.0, "duty [%]") if "duty_left" in rows else (
         "motor_speed_{}_rpm", 1.0, "motor speed [rpm]"
     )  # fmt: skip
     limit = 0.1
-    for side, color in _SIDE_COLOURS:
-        amperes = rows[f"motor_current_{side}_A"]
-        current.plot(time, amperes, color=color, lw=1.0, label=side)
-        drive.plot(time, factor * rows[column.format(side)], color=color, lw=1.0)
-        limit = max(limit, float(np.nanmax(np.abs(amperes[time > 0.1 * time[-1]]), initial=0.0)))
-    turn.plot(time, rows["yaw_rate_rad_s"], color=INK, lw=1.2)
-    low, high = current.get_ylim()
-    current.set(ylabel="current of a motor [A]", ylim=(max(low, -2.5 * limit), min(high, 2.5 * limit)))
-    current.legend(ncols=2)
-    drive.set_ylabel(label)
-    turn.set(ylabel="yaw rate [rad/s]", xlabel=f"time [{unit}]", xlim=(0, time[-1]))
+    for side, colour in _SIDE_COLOURS:
+        current = rows[f"motor_current_{side}_A"]
+        current_axes.plot(time, current, color=colour, lw=1.0, label=side)
+        drive_axes.plot(time, factor * rows[column.format(side)], color=colour, lw=1.0)
+        limit = max(limit, float(np.nanmax(np.abs(current[time > 0.1 * time[-1]]), initial=0.0)))
+    yaw_axes.plot(time, rows["yaw_rate_rad_s"], color=INK, lw=1.2)
+    low, high = current_axes.get_ylim()
+    current_axes.set(ylabel="current of a motor [A]", ylim=(max(low, -2.5 * limit), min(high, 2.5 * limit)))
+    current_axes.legend(ncols=2)
+    drive_axes.set_ylabel(label)
+    yaw_axes.set(ylabel="yaw rate [rad/s]", xlabel=f"time [{unit}]", xlim=(0, time[-1]))
     return fig
 
 
 def _right_axes(axes: Axes, label: str, colour: str) -> Axes:
     """Axes with their own scale at the right."""
-    other = axes.twinx()
-    other.grid(False)
-    other.spines["right"].set_visible(True)
-    other.tick_params(axis="y", colors=colour)
-    other.set_ylabel(label, color=colour)
-    return other
+    right = axes.twinx()
+    right.grid(False)
+    right.spines["right"].set_visible(True)
+    right.tick_params(axis="y", colors=colour)
+    right.set_ylabel(label, color=colour)
+    return right
 
 
 def _draw_legend(axes: Axes, *others: Axes) -> None:
@@ -104,55 +106,66 @@ def _draw_legend(axes: Axes, *others: Axes) -> None:
 
 #: Reversals above which a curve is drawn as its envelope, and number of time parts of the envelope: so few that it
 #: has no gaps.
-TURNS, PARTS = 200, 40
+REVERSALS, ENVELOPE_PARTS = 200, 40
 
 
 def _draw_curve(
     axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label: str, width: float = 1.0
 ) -> None:
     """A curve over time, or its range and mean in each part of the time if many cycles would fill the panel."""
-    if np.count_nonzero(np.diff(np.sign(np.diff(values)))) <= TURNS:
+    if np.count_nonzero(np.diff(np.sign(np.diff(values)))) <= REVERSALS:
         axes.plot(time, values, color=colour, lw=width, label=label)
         return
-    parts = np.array_split(np.arange(len(time)), PARTS)
-    ends = np.linspace(time[0], time[-1], PARTS + 1)
+    parts = np.array_split(np.arange(len(time)), ENVELOPE_PARTS)
+    ends = np.linspace(time[0], time[-1], ENVELOPE_PARTS + 1)
     means = np.diff(np.interp(ends, time, cumulative_trapezoid(values, time, initial=0))) / np.diff(ends)
-    least, greatest = ([end(values[rows]) for rows in parts] for end in (np.min, np.max))
+    least, greatest = ([extreme(values[rows]) for rows in parts] for extreme in (np.min, np.max))
     middle = [time[rows].mean() for rows in parts]
     axes.fill_between(middle, least, greatest, color=colour, alpha=0.15, lw=0)
     axes.plot((ends[1:] + ends[:-1]) / 2, means, color=colour, lw=width, label=label)
 
 
 def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool) -> None:
-    turning = "demanded_motor_speed_rpm" in rows  # a shaft's
-    speed = rows["motor_speed_rpm"] if turning else rows.get("speed_mm_s", rows["theoretical_speed_mm_s"])
+    is_shaft = "demanded_motor_speed_rpm" in rows  # a shaft's
+    speed = rows["motor_speed_rpm"] if is_shaft else rows.get("speed_mm_s", rows["theoretical_speed_mm_s"])
     _draw_curve(axes, time, speed, BLUE, "speed", 1.4)
-    demanded = rows["demanded_motor_speed_rpm" if turning else "demanded_speed_mm_s"]
-    if np.isfinite(demanded).any() and np.count_nonzero(np.diff(np.sign(np.diff(demanded)))) <= TURNS:
+    demanded = rows["demanded_motor_speed_rpm" if is_shaft else "demanded_speed_mm_s"]
+    if np.isfinite(demanded).any() and np.count_nonzero(np.diff(np.sign(np.diff(demanded)))) <= REVERSALS:
         axes.plot(time, demanded, color=INK, lw=0.9, ls=(0, (4, 2)), label="demanded")
-    axes.set_ylabel("motor speed [rpm]" if turning else "speed [mm/s]")
-    if turning or not np.any(rows["slope_deg"]):
-        add_corner_note(axes, "" if turning else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
+    axes.set_ylabel("motor speed [rpm]" if is_shaft else "speed [mm/s]")
+    if is_shaft or not np.any(rows["slope_deg"]):
+        add_corner_note(
+            axes, "" if is_shaft else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT
+        )
         _draw_legend(axes)
         return
-    slope = _right_axes(axes, "slope [°]", GREEN)
+    slope_axes = _right_axes(axes, "slope [°]", GREEN)
     style = "default" if linear else "steps-post"
-    slope.plot(time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle=style)
+    slope_axes.plot(time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle=style)
     largest_slope = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
-    slope.set_ylim(-largest_slope, largest_slope)
-    _draw_legend(axes, slope)
+    slope_axes.set_ylim(-largest_slope, largest_slope)
+    _draw_legend(axes, slope_axes)
 
 
 def _draw_current(axes: Axes, time: np.ndarray, rows: Columns, sides: float) -> None:
-    current, driven = sides * mean_of_motors(rows, "motor_current", "_A"), mean_of_motors(rows, "duty", "")
+    current = sides * mean_of_motors(rows, "motor_current", "_A")
+    duty = mean_of_motors(rows, "duty", "")
     _draw_curve(axes, time, current, VERMILION, "current")
-    top = int(np.argmax(np.abs(current)))
-    axes.plot(time[top], current[top], marker="o", ms=4, color=INK, ls="none", label=f"peak {current[top]:.2f} A")
+    peak_row = int(np.argmax(np.abs(current)))
+    axes.plot(
+        time[peak_row],
+        current[peak_row],
+        marker="o",
+        ms=4,
+        color=INK,
+        ls="none",
+        label=f"peak {current[peak_row]:.2f} A",
+    )
     axes.set_ylabel("current [A]")
-    duty = _right_axes(axes, "duty [%]", PURPLE)
-    _draw_curve(duty, time, 100 * driven, PURPLE, "duty", 0.9)
-    duty.set_ylim(-110 if (driven < 0).any() else 0, 110)
-    _draw_legend(axes, duty)
+    duty_axes = _right_axes(axes, "duty [%]", PURPLE)
+    _draw_curve(duty_axes, time, 100 * duty, PURPLE, "duty", 0.9)
+    duty_axes.set_ylim(-110 if (duty < 0).any() else 0, 110)
+    _draw_legend(axes, duty_axes)
 
 
 def mean_of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
@@ -196,38 +209,42 @@ def _draw_source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
         add_corner_note(axes, "broken line: cells fall below their cut-off", y=0.06, va="bottom", color=FAINT)
 
 
-#: A path bends by no more between two points that are drawn [rad].
+#: Largest change of yaw between two drawn points of a path [rad].
 BEND = 0.05
 
 
-def _draw_outline(axes: Axes, robot: Robot, row: Json, place: complex, yaw: float, color: str) -> None:
-    """The robot from above: its contact lines and an arrow pointing ahead. `place`: ahead + i · left [m]."""
+def _draw_outline(axes: Axes, robot: Robot, row: Json, position: complex, yaw: float, colour: str) -> None:
+    """Draws the robot from above: contact lines and an arrow ahead. `position`: ahead + i · left [m]."""
     length = float(robot.running_gear.wheelbase)
     width = float(robot.configurations[str(row["configuration"])].turning.width)
     ahead = np.exp(1j * yaw)
     for side in (0.5j, -0.5j):
-        ends = place + ahead * (side * width + length * np.array([0.5, -0.5]))
-        axes.plot(-ends.imag, ends.real, color=color, lw=3.5, solid_capstyle="round")
-    tip, arrow = place + 0.5 * length * ahead, {"arrowstyle": "-|>", "color": color}
-    axes.annotate("", (-tip.imag, tip.real), (-place.imag, place.real), arrowprops=arrow)
+        line_ends = position + ahead * (side * width + length * np.array([0.5, -0.5]))
+        axes.plot(-line_ends.imag, line_ends.real, color=colour, lw=3.5, solid_capstyle="round")
+    tip = position + 0.5 * length * ahead
+    arrow = {"arrowstyle": "-|>", "color": colour}
+    axes.annotate("", (-tip.imag, tip.real), (-position.imag, position.real), arrowprops=arrow)
 
 
 def path_arcs(
     x: np.ndarray, y: np.ndarray, yaw: np.ndarray
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-    """A path between places, each stretch at a speed and yaw rate of its own: an arc. Steps of a run may be long.
+    """Points of a path of circular arcs through given positions. Steps of a run may be too long for straight lines.
 
     Args:
-        x, y: places [m].
-        yaw: there, counted on over a turn [rad], shape (rows,).
+        x, y: positions [m].
+        yaw: yaw at the positions, not wrapped at a full turn [rad], shape (rows,).
     """
-    place, yaw_changes = x + 1j * y, np.diff(yaw)
-    pieces = np.ceil(np.abs(yaw_changes) / BEND).clip(1, 100).astype(int)
-    k = np.repeat(np.arange(len(pieces)), pieces)
-    share = (np.arange(len(k)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[k]
-    bent = np.where(pieces[k] > 1, yaw_changes[k], BEND)  # else share is 0 and any will do
-    between = place[k] + np.diff(place)[k] * np.expm1(1j * share * bent) / np.expm1(1j * bent)
-    path_points = np.append(between, place[-1])
+    position = x + 1j * y
+    yaw_changes = np.diff(yaw)
+    piece_counts = np.ceil(np.abs(yaw_changes) / BEND).clip(1, 100).astype(int)
+    piece = np.repeat(np.arange(len(piece_counts)), piece_counts)
+    share = (np.arange(len(piece)) - np.repeat(np.cumsum(piece_counts) - piece_counts, piece_counts)) / piece_counts[
+        piece
+    ]
+    bend = np.where(piece_counts[piece] > 1, yaw_changes[piece], BEND)  # else share is 0 and any will do
+    between = position[piece] + np.diff(position)[piece] * np.expm1(1j * share * bend) / np.expm1(1j * bend)
+    path_points = np.append(between, position[-1])
     return path_points.real, path_points.imag
 
 
@@ -236,28 +253,29 @@ def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.nda
     finite = np.isfinite(x)
     x, y, yaw = x[finite], y[finite], yaw[finite]
     fig, ((axes,),) = new_figure(1, 1, 4.6)
-    ahead, aside = path_arcs(x, y, yaw)
-    axes.plot(-aside, ahead, color=BLUE)
-    for k, color in ((0, FAINT), (len(x) // 2, FAINT), (-1, INK)):
-        _draw_outline(axes, robot, row, complex(x[k], y[k]), yaw[k], color)
+    path_x, path_y = path_arcs(x, y, yaw)
+    axes.plot(-path_y, path_x, color=BLUE)
+    for k, colour in ((0, FAINT), (len(x) // 2, FAINT), (-1, INK)):
+        _draw_outline(axes, robot, row, complex(x[k], y[k]), yaw[k], colour)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="to the right of the start [m]", ylabel="uphill of the start, or ahead of it [m]")
     return fig
 
 
 def draw_yaw_rates(turns: Columns, row: Json) -> Figure:
-    """Currents of both sides and power over the yaw rate of settled turns, which on the spot has a limit, unlike the
-    curvature. The requested turn is marked.
+    """Currents of both sides and power over the yaw rate of settled turns. The requested turn is marked.
+
+    The yaw rate is finite when a robot turns on the spot, unlike the curvature.
     """
-    fig, ((current, power),) = new_figure(1, 2, 3.4)
+    fig, ((current_axes, power_axes),) = new_figure(1, 2, 3.4)
     rate = np.asarray(turns["yaw_rate_rad_s"], float)
     order = 1 + np.argsort(rate[1:])  # the first is the requested turn
-    lines = [(current, f"motor_current_{side}_A", color, side) for side, color in _SIDE_COLOURS]
-    for axes, column, color, label in (*lines, (power, "power_supply_W", INK, None)):
-        axes.plot(rate[order], np.asarray(turns[column])[order], color=color, label=label)
-        axes.plot(float(row["yaw_rate_rad_s"]), float(row[column]), "o", color=color)
-    current.legend()
-    for axes, label in ((current, "current of a motor [A]"), (power, "power of the supply [W]")):
+    lines = [(current_axes, f"motor_current_{side}_A", colour, side) for side, colour in _SIDE_COLOURS]
+    for axes, column, colour, label in (*lines, (power_axes, "power_supply_W", INK, None)):
+        axes.plot(rate[order], np.asarray(turns[column])[order], color=colour, label=label)
+        axes.plot(float(row["yaw_rate_rad_s"]), float(row[column]), "o", color=colour)
+    current_axes.legend()
+    for axes, label in ((current_axes, "current of a motor [A]"), (power_axes, "power of the supply [W]")):
         axes.axhline(0, color=FAINT, lw=0.8)
         axes.set(xlabel="yaw rate, positive to the left [rad/s]", ylabel=label)
     return fig

@@ -30,9 +30,9 @@ def power_by_item(runs: Columns) -> Columns:
     resistance includes the acceleration.
     """
     chain = [runs[f"power_{place}_W"] for place in ("supply", "motor", "gear", "ground", "lift")]
-    losses = [above - below for above, below in itertools.pairwise(chain)]
-    ends = [np.maximum(chain[-1], 0.0), np.maximum(-chain[0], 0.0)]
-    return dict(zip(ITEMS, [*losses, *ends], strict=True))
+    losses = [power_in - power_out for power_in, power_out in itertools.pairwise(chain)]
+    useful_powers = [np.maximum(chain[-1], 0.0), np.maximum(-chain[0], 0.0)]
+    return dict(zip(ITEMS, [*losses, *useful_powers], strict=True))
 
 
 def power_sources(runs: Columns) -> tuple[np.ndarray, np.ndarray]:
@@ -42,7 +42,8 @@ def power_sources(runs: Columns) -> tuple[np.ndarray, np.ndarray]:
 
 def drawable_runs(runs: Columns) -> np.ndarray:
     """Mask of runs with numbers and without negative losses."""
-    parts, supplied_power = np.stack(list(power_by_item(runs).values())), sum(power_sources(runs))
+    parts = np.stack(list(power_by_item(runs).values()))
+    supplied_power = sum(power_sources(runs))
     return (
         np.isfinite(parts).all(0) & (parts >= -1e-6 * np.maximum(supplied_power, 1.0)).all(0) & (supplied_power > 0)
     )
@@ -56,19 +57,24 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     """One bar for each run [W], from the motor's losses to the power that lifts the robot or that the load takes."""
     fig, ((axes,),) = new_figure(1, 1, 1.15 + 0.42 * len(names))
     supply, slope = power_sources(runs)
-    total, places, left = supply + slope, np.arange(len(names)), np.zeros(len(names))
+    total = supply + slope
+    bar_positions = np.arange(len(names))
+    bar_starts = np.zeros(len(names))
     for item, power in power_by_item(runs).items():
         if power.max() > 1e-6:
-            power, colour = np.maximum(power, 0.0), ITEMS[item]
+            power = np.maximum(power, 0.0)
+            colour = ITEMS[item]
             label = item if has_ground else ON_SHAFT.get(item, item)
-            bars = axes.barh(places, power, left=left, height=0.7, color=colour, label=label, ec="white", lw=0.6)
-            numbers = [f"{width:.1f}" if width >= 0.04 * total.max() else "" for width in power]
-            axes.bar_label(bars, numbers, label_type="center", color="white" if colour in _DARK else "black")
-            left = left + power
-    for y, (watts, falls) in enumerate(zip(supply, slope, strict=True)):
-        text = f"{watts:.1f} W" + (f" + {falls:.1f} W from the slope" if falls > 1e-6 else "")
-        axes.text(watts + falls, y, f"  {text}", va="center")
-    axes.set_yticks(places, names)
+            bars = axes.barh(
+                bar_positions, power, left=bar_starts, height=0.7, color=colour, label=label, ec="white", lw=0.6
+            )
+            bar_labels = [f"{width:.1f}" if width >= 0.04 * total.max() else "" for width in power]
+            axes.bar_label(bars, bar_labels, label_type="center", color="white" if colour in _DARK else "black")
+            bar_starts = bar_starts + power
+    for y, (from_supply, from_slope) in enumerate(zip(supply, slope, strict=True)):
+        text = f"{from_supply:.1f} W" + (f" + {from_slope:.1f} W from the slope" if from_slope > 1e-6 else "")
+        axes.text(from_supply + from_slope, y, f"  {text}", va="center")
+    axes.set_yticks(bar_positions, names)
     axes.invert_yaxis()
     axes.grid(False)
     axis_factor = 1.35 if (slope > 1e-6).any() else 1.1
@@ -90,7 +96,8 @@ def draw_drive_chart(robot: Robot, curves: Mapping[float, Columns], points: Colu
         "motor_rpm": "motor speed [rpm]", "motor_A": "current of one motor [A]",
         "efficiency_percent": "efficiency [%]",
     }  # fmt: skip
-    limit, largest_torque = float(robot.driver.current_limit), 0.0
+    limit = float(robot.driver.current_limit)
+    largest_torque = 0.0
     for (voltage, curve), style in zip(curves.items(), ("-", "--", ":"), strict=False):
         torque = curve["torque_Nm"]
         if torque.size < 2:
@@ -104,9 +111,9 @@ def draw_drive_chart(robot: Robot, curves: Mapping[float, Columns], points: Colu
                 axes.axvspan(0, continuous, color=GREEN, alpha=0.18, lw=0, label="continuous")
                 axes.axvspan(continuous, largest_torque, color=ORANGE, alpha=0.12, lw=0, label="short time")
                 axes.set_xlim(0, largest_torque)
-        shown = torque <= largest_torque
+        is_shown = torque <= largest_torque
         for axes, (name, label) in zip(panels, labels.items(), strict=True):
-            axes.plot(torque[shown], curve[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
+            axes.plot(torque[is_shown], curve[name][is_shown], style, color=BLUE, label=f"{voltage:.3g} V")
             axes.set(xlabel="torque at the gearbox output [N·m]", ylabel=label)
             axes.set_ylim(bottom=0)
     if points is not None:
@@ -130,24 +137,38 @@ def draw_drive_plane(plane: Columns, points: Columns) -> Figure:
         points: torques of the load and of the motor in measured runs.
     """
     load, forward, backward = plane["load"], plane["forward"], plane["backward"]
-    most = load[-1]
-    fig, ((axes, share),) = new_figure(1, 2, 3.6)
+    largest_load = load[-1]
+    fig, ((axes, efficiency_axes),) = new_figure(1, 2, 3.6)
     axes.fill_between(load, backward, forward, color="#e3e3e3", lw=0, label="at rest, friction holds the load")
     for efficiency in EFFICIENCIES:
-        axes.plot([-most, 0, most], [-most * efficiency, 0, most / efficiency], ":", color=FAINT, lw=1)
-        axes.annotate(f"{100 * efficiency:.0f} %", (most, most / efficiency), (2, 0), textcoords="offset points",
-                      va="center", annotation_clip=False)  # fmt: skip
+        axes.plot(
+            [-largest_load, 0, largest_load],
+            [-largest_load * efficiency, 0, largest_load / efficiency],
+            ":",
+            color=FAINT,
+            lw=1,
+        )
+        axes.annotate(f"{100 * efficiency:.0f} %", (largest_load, largest_load / efficiency), (2, 0),
+                      textcoords="offset points", va="center", annotation_clip=False)  # fmt: skip
     axes.plot(load, load, "--", color=FAINT, lw=1, label="without losses")
     axes.plot(load, forward, color=BLUE, label="runs forward")
     axes.plot(load, backward, color=ORANGE, label="runs backward")
     axes.plot(points["load"], points["motor"], "o", ms=4, color=INK, label="measured")
     label = "torque of the load [N·m]"
-    axes.set(xlabel=label, ylabel="motor torque × ratio [N·m]", title="drive and back-drive", xlim=(-most, most))
-    ahead, behind = load > 0, load < 0
-    share.plot(load[ahead], 100 * load[ahead] / forward[ahead], color=BLUE, label="motor drives the load")
-    returned = 100 * np.maximum(forward[behind] / load[behind], 0)
-    share.plot(-load[behind], returned, "--", color=BLUE, label="load drives the motor")
-    share.set(xlabel=label, ylabel="efficiency [%]", ylim=(0, 103), title="efficiency each way")
-    share.legend(loc="lower right")
+    axes.set(
+        xlabel=label,
+        ylabel="motor torque × ratio [N·m]",
+        title="drive and back-drive",
+        xlim=(-largest_load, largest_load),
+    )
+    is_driving = load > 0
+    is_driven = load < 0
+    efficiency_axes.plot(
+        load[is_driving], 100 * load[is_driving] / forward[is_driving], color=BLUE, label="motor drives the load"
+    )
+    returned = 100 * np.maximum(forward[is_driven] / load[is_driven], 0)
+    efficiency_axes.plot(-load[is_driven], returned, "--", color=BLUE, label="load drives the motor")
+    efficiency_axes.set(xlabel=label, ylabel="efficiency [%]", ylim=(0, 103), title="efficiency each way")
+    efficiency_axes.legend(loc="lower right")
     outer_legend(axes, "upper left")
     return fig

@@ -40,53 +40,56 @@ MAPS = ("reaction", "current", "speed")
 _MARKS = {"reaction": (BLUE, "o"), "current": (VERMILION, "s")}
 _BANDS = {"bounce": BLUE, "pitch": ORANGE}
 _OTHERS = (GREEN, PURPLE, SKY)
-_UNREAD = {"slides": ">", "failed": "x", "tips": "^", "stalled": "_", "too_slow": "|", "battery_empty": "+"}
+_STATUS_MARKERS = {"slides": ">", "failed": "x", "tips": "^", "stalled": "_", "too_slow": "|", "battery_empty": "+"}
 
 
-def draw_resonance_map(found: ResonanceResult) -> Figure:
+def draw_resonance_map(result: ResonanceResult) -> Figure:
     """Natural frequencies and harmonics of the passing frequency. Below them, ripple at every speed and payload."""
-    heights = [4.4, *[0.5 + 0.2 * len(found.modes)] * len(MAPS)]
+    heights = [4.4, *[0.5 + 0.2 * len(result.modes)] * len(MAPS)]
     fig, grid = new_figure(4, 1, sum(heights) + 0.6, sharex=True, height_ratios=heights)
     campbell, *maps = grid[:, 0]
-    _draw_campbell_diagram(campbell, found)
+    _draw_campbell_diagram(campbell, result)
     for axes, name in zip(maps, MAPS, strict=True):
-        _draw_ripple_map(axes, found, name)
+        _draw_ripple_map(axes, result, name)
     maps[-1].set_xlabel("speed of the robot [mm/s]")
-    campbell.set_xlim(0, 1.06 * np.nanmax(found.table["speed_mean_mm_s"]))
+    campbell.set_xlim(0, 1.06 * np.nanmax(result.table["speed_mean_mm_s"]))
     return fig
 
 
-def _draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
+def _draw_campbell_diagram(axes: Axes, result: ResonanceResult) -> None:
     """Lines n × V / S, bands of natural frequencies, and the strongest line of each run, larger for more ripple."""
-    table, parts, read = found.table, found.passing, found.read
-    bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
-    lines = [table[f"{name}_frequency_Hz"][read] for name in _MARKS]
-    highest = float(np.nanpercentile(np.concatenate(lines), 90)) if read.any() else 0.0
-    top, fastest = 1.15 * max([highest, *bands, 10.0]), float(np.nanmax(table["speed_mean_mm_s"]))
-    place = np.inf
+    table, passing, is_evaluated = result.table, result.passing, result.is_evaluated
+    bands = [m.high for modes in result.modes.values() for m in modes if m.resonant]
+    lines = [table[f"{name}_frequency_Hz"][is_evaluated] for name in _MARKS]
+    highest = float(np.nanpercentile(np.concatenate(lines), 90)) if is_evaluated.any() else 0.0
+    top = 1.15 * max([highest, *bands, 10.0])
+    fastest = float(np.nanmax(table["speed_mean_mm_s"]))
+    label_speed = np.inf
     for order in range(1, ORDERS + 1):
-        at_end, last = order * fastest * MM / parts.travel, place
-        axes.plot([0, fastest], [0, at_end], color=FAINT, lw=0.8, zorder=1)
-        place = fastest * min(1.0, 0.985 * top / at_end)
-        if at_end > top and last - place < 0.03 * fastest:
+        end_frequency = order * fastest * MM / passing.travel
+        previous_label_speed = label_speed
+        axes.plot([0, fastest], [0, end_frequency], color=FAINT, lw=0.8, zorder=1)
+        label_speed = fastest * min(1.0, 0.985 * top / end_frequency)
+        if end_frequency > top and previous_label_speed - label_speed < 0.03 * fastest:
             break  # labels and lines would overlap
-        axes.annotate(f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0), textcoords="offset points",
-                      color=FAINT, va="center" if at_end <= top else "top")  # fmt: skip
-    _draw_mode_bands(axes, found)
+        axes.annotate(f"{order}×", (label_speed, min(end_frequency, 0.985 * top)), xytext=(4, 0),
+                      textcoords="offset points", color=FAINT,
+                      va="center" if end_frequency <= top else "top")  # fmt: skip
+    _draw_mode_bands(axes, result)
     for name, (colour, marker) in _MARKS.items():
-        ripple = table[f"{name}_ripple_percent"][read]
-        most = float(np.nanmax(ripple))
+        ripple = table[f"{name}_ripple_percent"][is_evaluated]
+        largest_ripple = float(np.nanmax(ripple))
         axes.scatter(
-            table["speed_mean_mm_s"][read], table[f"{name}_frequency_Hz"][read],
-            s=4 + 60 * (ripple / max(most, 1e-9)) ** 2, marker=marker, color=colour, alpha=0.55, lw=0, zorder=3,
-            label=f"{SIGNALS[name].label}, up to {ripple_percent(most)}",
+            table["speed_mean_mm_s"][is_evaluated], table[f"{name}_frequency_Hz"][is_evaluated],
+            s=4 + 60 * (ripple / max(largest_ripple, 1e-9)) ** 2, marker=marker, color=colour, alpha=0.55, lw=0,
+            zorder=3, label=f"{SIGNALS[name].label}, up to {ripple_percent(largest_ripple)}",
         )  # fmt: skip
-    hits = [p for p in found.strong if p.mode]
+    confirmed = [p for p in result.strong_peaks if p.mode]
     axes.scatter(
-        [p.speed / MM for p in hits], [p.frequency for p in hits], s=130, marker="*", color="white",
-        edgecolor=INK, lw=0.9, zorder=4, label="ripple peaks at a natural frequency: avoid" if hits else None,
+        [p.speed / MM for p in confirmed], [p.frequency for p in confirmed], s=130, marker="*", color="white",
+        edgecolor=INK, lw=0.9, zorder=4, label="ripple peaks at a natural frequency: avoid" if confirmed else None,
     )  # fmt: skip
-    heading = f"{found.configuration}: {parts.name} pass every {parts.travel / MM:.4g} mm of travel"
+    heading = f"{result.configuration}: {passing.name} pass every {passing.travel / MM:.4g} mm of travel"
     axes.set(ylim=(0, top), ylabel="frequency [Hz]", title=heading)
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, handletextpad=0.2, columnspacing=1.2,
@@ -94,12 +97,12 @@ def _draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     )  # fmt: skip
 
 
-def _draw_mode_bands(axes: Axes, found: ResonanceResult) -> None:
+def _draw_mode_bands(axes: Axes, result: ResonanceResult) -> None:
     """One band for each mode, from the smallest to the largest frequency over payloads and positions of the belt."""
     other_colours = iter(_OTHERS * 3)
-    names = dict.fromkeys(m.name for modes in found.modes.values() for m in modes if m.resonant)
+    names = dict.fromkeys(m.name for modes in result.modes.values() for m in modes if m.resonant)
     for name in names:
-        modes = [(p, m) for p, members in found.modes.items() for m in members if m.name == name and m.resonant]
+        modes = [(p, m) for p, members in result.modes.items() for m in members if m.name == name and m.resonant]
         colour = _BANDS.get(name) or next(other_colours)
         low, high = min(m.low for _, m in modes), max(m.high for _, m in modes)
         axes.axhspan(low, high, color=colour, alpha=0.13, lw=0, zorder=0)
@@ -115,27 +118,30 @@ def _draw_mode_bands(axes: Axes, found: ResonanceResult) -> None:
         )  # fmt: skip
 
 
-def _draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
+def _draw_ripple_map(axes: Axes, result: ResonanceResult, name: str) -> None:
     """Ripple of one signal over speed, one row per payload. Bars mark peaks to avoid."""
-    table, payloads, speed = found.table, list(found.modes), found.travel
-    ripple, unsettled = table[f"{name}_ripple_percent"], table["status"] != "converged"
-    settled = found.read & ~unsettled
-    largest = float(np.nanmax(ripple[settled if settled.any() else found.read])) or 1.0
+    table = result.table
+    payloads = list(result.modes)
+    speed = result.run_speeds
+    ripple = table[f"{name}_ripple_percent"]
+    is_unsettled = table["status"] != "converged"
+    is_settled = result.is_evaluated & ~is_unsettled
+    largest = float(np.nanmax(ripple[is_settled if is_settled.any() else result.is_evaluated])) or 1.0
     norm = colors.Normalize(0, largest)
     for row, payload in enumerate(payloads):
         rows = np.flatnonzero(table["payload_kg"] == payload)
         rows = rows[np.argsort(speed[rows])]
-        good = rows[found.read[rows]]
-        if len(good) > 1:
-            x = speed[good]
+        evaluated_rows = rows[result.is_evaluated[rows]]
+        if len(evaluated_rows) > 1:
+            x = speed[evaluated_rows]
             middle = (x[1:] + x[:-1]) / 2
             edges = np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
-            axes.pcolormesh(edges, [row - 0.5, row + 0.5], ripple[good][None], norm=norm, cmap="YlOrBr",
+            axes.pcolormesh(edges, [row - 0.5, row + 0.5], ripple[evaluated_rows][None], norm=norm, cmap="YlOrBr",
                             rasterized=True)  # fmt: skip
-        for k in rows[unsettled[rows] & np.isfinite(speed[rows])]:
-            marker = _UNREAD.get(str(table["status"][k]), ".")
+        for k in rows[is_unsettled[rows] & np.isfinite(speed[rows])]:
+            marker = _STATUS_MARKERS.get(str(table["status"][k]), ".")
             axes.scatter(speed[k], row, marker=marker, s=14, color=INK, lw=0.9, zorder=4)
-    for p in found.strong:
+    for p in result.strong_peaks:
         if p.signal == name:
             place = (p.low / MM, payloads.index(p.payload) - 0.5)
             axes.add_patch(Rectangle(place, (p.high - p.low) / MM, 1.0, fill=False, ec=INK, lw=1.3, zorder=3,
@@ -145,8 +151,8 @@ def _draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     axes.grid(False)
     axes.figure.colorbar(ScalarMappable(norm, "YlOrBr"), ax=axes, pad=0.01, aspect=8, label="sd / mean [%]")
     remarks = [] if largest >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
-    statuses = dict.fromkeys(map(str, table["status"][unsettled]))
-    remarks += [f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in statuses]
+    statuses = dict.fromkeys(map(str, table["status"][is_unsettled]))
+    remarks += [f"{_STATUS_MARKERS.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in statuses]
     axes.set_title(f"Ripple of {SIGNALS[name].label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
 
 
@@ -186,7 +192,7 @@ class GearRun:
         return bool(instant <= self.time[-1] - TAIL)
 
     @property
-    def shown_time(self) -> np.ndarray:
+    def drawn_time(self) -> np.ndarray:
         """Time since the start of the drawn part [ms]."""
         time = self.time[self.tail(SHOWN)]
         return 1e3 * (time - time[0])
@@ -210,7 +216,7 @@ def gear_runs(
     history: Any,
     status: np.ndarray,
     guide_share: np.ndarray,
-    which: Sequence[int],
+    configuration_indices: Sequence[int],
     names: Sequence[str],
 ) -> list[GearRun]:
     """Members of a batch of runs whose running gear is resolved.
@@ -219,47 +225,52 @@ def gear_runs(
         history: time, signals and reactions of the batch.
         status: codes of how its members ended.
         guide_share: guide share of each member [-].
-        which: index of each member's configuration in `robot`.
+        configuration_indices: index of each member's configuration in `robot`.
         names: headings of the members.
     """
     import jax
 
-    answer = []
+    gears = []
     for k, name in enumerate(names):
-        on_tracks = float(robot.configurations.members[int(which[k])].on_tracks) > 0.5
+        on_tracks = float(robot.configurations.members[int(configuration_indices[k])].on_tracks) > 0.5
         over_time = (history.time, history.signals, history.reactions)
         time, signals, reactions = jax.tree.map(lambda x, k=k: np.asarray(x[k]), over_time)
-        status_word, share = STATUSES[int(status[k])], float(guide_share[k])
-        answer.append(
+        status_word = STATUSES[int(status[k])]
+        share = float(guide_share[k])
+        gears.append(
             GearRun(name, on_tracks, status_word, float(robot.radius_pulley), time, signals, reactions, share)
         )
-    return answer
+    return gears
 
 
 def ripple_row(gear: GearRun) -> tuple[Any, ...]:
     """Row of the table of ripples: run, pitch, period measured and by eq. (34), amplitudes, load on the guides."""
-    tail, signals = gear.tail(TAIL), gear.signals
-    shown = signals.total_current, signals.speed, signals.normal
-    ripples = [ripple_peaks.measure_ripple(gear.time[tail], x[tail]) for x in shown]
+    tail = gear.tail(TAIL)
+    signals = gear.signals
+    drawn_signals = signals.total_current, signals.speed, signals.normal
+    ripples = [ripple_peaks.measure_ripple(gear.time[tail], x[tail]) for x in drawn_signals]
     pitch = "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm"
     amplitudes = (100 * amplitude for _, amplitude, _ in ripples)
     on_guides = 100 * gear.guide_share if gear.on_tracks else None
     return gear.name, pitch, 1e3 * ripples[0][2], 1e3 * gear.period, *amplitudes, on_guides
 
 
-def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
+def draw_current_ripple(gears: list[GearRun], title: str = "{}") -> Figure:
     """Total current over the last `SHOWN` seconds of each run, with the period expected from eq. (34)."""
-    fig, (panels,) = new_figure(1, len(shown), 3.0)
-    look = configuration_looks(gear.name for gear in shown)
-    for axes, gear in zip(panels, shown, strict=True):
-        time, current, period = gear.shown_time, gear.signals.total_current[gear.tail(SHOWN)], 1e3 * gear.period
-        axes.plot(time, current, color=look[gear.name][0])
+    fig, (panels,) = new_figure(1, len(gears), 3.0)
+    looks = configuration_looks(gear.name for gear in gears)
+    for axes, gear in zip(panels, gears, strict=True):
+        time = gear.drawn_time
+        current = gear.signals.total_current[gear.tail(SHOWN)]
+        period = 1e3 * gear.period
+        axes.plot(time, current, color=looks[gear.name][0])
         axes.axhline(current.mean(), color=FAINT, lw=0.9)
         low, high = current.min(), current.max()
         span = max(high - low, 1e-6)
         axes.set(ylim=(low - 0.2 * span, high + 0.45 * span), xlabel="time [ms]", ylabel="total current [A]")
         axes.ticklabel_format(axis="y", useOffset=False)
-        start, level = time[int(np.argmax(current[: len(current) // 2]))], high + 0.12 * span
+        start = time[int(np.argmax(current[: len(current) // 2]))]
+        level = high + 0.12 * span
         arrow = dict(arrowstyle="<->", color=INK, lw=1.0)
         axes.annotate("", (start, level), (start + period, level), arrowprops=arrow)
         axes.text(start, level + 0.05 * span, f"{period:.1f} ms, eq. (34)", va="bottom")
@@ -270,13 +281,14 @@ def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
 def draw_touchdowns(gear: GearRun, title: str = "grousers land (dotted)") -> Figure:
     """Current of a run on tracks over time with touchdowns marked, above the load on each grouser."""
     fig, ((upper,), (lower,)) = new_figure(2, 1, 5.0, sharex=True)
-    rows, time = gear.tail(SHOWN), gear.shown_time
+    rows = gear.tail(SHOWN)
+    time = gear.drawn_time
     loads = gear.reactions.grouser[rows]
     upper.plot(time, gear.signals.total_current[rows], color=BLUE)
     upper.set(ylabel="total current [A]", title=title)
-    for load, shade in zip(loads.T, itertools.cycle((BLUE, ORANGE, GREEN)), strict=False):
+    for load, colour in zip(loads.T, itertools.cycle((BLUE, ORANGE, GREEN)), strict=False):
         if (load > 0).any():
-            lower.plot(time, np.where(load > 0, load, np.nan), color=shade, lw=1.0)
+            lower.plot(time, np.where(load > 0, load, np.nan), color=colour, lw=1.0)
     lower.set(xlabel="time [ms]", ylabel="normal reaction of a grouser [N]", ylim=(0, None))
     for instant in ripple_peaks.touchdown_times(time, loads, gear.reactions.place[rows]):
         upper.axvline(instant, color=INK, lw=0.9, ls=":")
@@ -284,12 +296,14 @@ def draw_touchdowns(gear: GearRun, title: str = "grousers land (dotted)") -> Fig
     return fig
 
 
-def draw_reactions(shown: list[GearRun], title: str = "{}, one side") -> Figure:
+def draw_reactions(gears: list[GearRun], title: str = "{}, one side") -> Figure:
     """Normal reactions of one side: of all grousers and the lower guide on tracks, of both wheels on wheels."""
-    fig, (panels,) = new_figure(1, len(shown), 3.2)
-    look = configuration_looks(gear.name for gear in shown)
-    for axes, gear in zip(panels, shown, strict=True):
-        loads, rows, colour = gear.reactions, gear.tail(SHOWN), look[gear.name][0]
+    fig, (panels,) = new_figure(1, len(gears), 3.2)
+    looks = configuration_looks(gear.name for gear in gears)
+    for axes, gear in zip(panels, gears, strict=True):
+        loads = gear.reactions
+        rows = gear.tail(SHOWN)
+        colour = looks[gear.name][0]
         if gear.on_tracks:
             lines = {
                 "all grousers": (loads.grouser[rows].sum(-1), colour),
@@ -302,7 +316,7 @@ def draw_reactions(shown: list[GearRun], title: str = "{}, one side") -> Figure:
                 "rear wheel": (wheels[:, 1], GREEN),
             }  # fmt: skip
         for label, (values, shade) in lines.items():
-            axes.plot(gear.shown_time, values, color=shade, lw=1.4, alpha=0.9, label=label)
+            axes.plot(gear.drawn_time, values, color=shade, lw=1.4, alpha=0.9, label=label)
         top = max(float(np.max(values)) for values, _ in lines.values())
         axes.set(
             ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]", title=title.format(gear.name)

@@ -34,7 +34,7 @@ from sweeps.report.run_tables import axis_title, imposed_column, quantity_column
 from sweeps.report.sweep_report import VariedQuantity
 
 _PANELS = 3  # most voltages drawn for a configuration
-_CELLS, _ROWS = 20, 12  # most labelled cells across a figure, and most rows of them
+_LABELLED_COLUMNS, _LABELLED_ROWS = 20, 12  # most labelled cells across a figure, and most rows of them
 
 
 def _panels_by_imposed(runs: Columns) -> list[tuple[str, np.ndarray]]:
@@ -67,24 +67,27 @@ def draw_sweep(runs: Columns, channel: Channel) -> Figure:
     levels = {name: np.unique(runs[name]).size for name in axes_of_grid if name in runs}
     if min(levels.get("payload_kg", 1), levels.get("slope_deg", 1)) == 1:
         return _draw_lines(runs, channel, max(levels, key=lambda name: levels[name] > 1))
-    kinds, panels = list(dict.fromkeys(runs["configuration"])), _panels_by_imposed(runs)
+    configurations = list(dict.fromkeys(runs["configuration"]))
+    panels = _panels_by_imposed(runs)
     values = _values_with_number(runs, channel)
     low, high = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
     norm = colors.Normalize(low, high if high > low else low + 1.0) if low <= high else colors.Normalize(0.0, 1.0)
     height = max(2.0, min(0.3 * levels["payload_kg"], 2.2) + 1.0)
-    fig, grid = new_figure(len(kinds), len(panels), height * len(kinds) + 0.5)
-    for row, kind in zip(grid, kinds, strict=True):
+    fig, grid = new_figure(len(configurations), len(panels), height * len(configurations) + 0.5)
+    for row, configuration in zip(grid, configurations, strict=True):
         for axes, (imposed, mask) in zip(row, panels, strict=True):
-            pick = mask & (runs["configuration"] == kind)
-            of_panel = {n: runs[n][pick] for n in ("slope_deg", "payload_kg", "status")}
-            _draw_map(axes, of_panel, values[pick], channel, norm, _CELLS // len(panels))
-            axes.set(title=f"{kind}, {imposed}", xlabel=axis_title("slope_deg"), ylabel=axis_title("payload_kg"))
+            is_in_panel = mask & (runs["configuration"] == configuration)
+            panel_runs = {n: runs[n][is_in_panel] for n in ("slope_deg", "payload_kg", "status")}
+            _draw_map(axes, panel_runs, values[is_in_panel], channel, norm, _LABELLED_COLUMNS // len(panels))
+            axes.set(
+                title=f"{configuration}, {imposed}", xlabel=axis_title("slope_deg"), ylabel=axis_title("payload_kg")
+            )
     fig.colorbar(ScalarMappable(norm, "viridis"), ax=grid, shrink=0.8, pad=0.01, label=axis_label(channel))
     return fig
 
 
 def _draw_map(
-    axes: Axes, runs: Columns, values: np.ndarray, channel: Channel, norm: colors.Normalize, most: int
+    axes: Axes, runs: Columns, values: np.ndarray, channel: Channel, norm: colors.Normalize, max_columns: int
 ) -> None:
     """Map of a channel. Cells show their numbers if there are at most so many columns."""
     axes.grid(False)
@@ -97,16 +100,17 @@ def _draw_map(
     image[y, x] = values
     axes.imshow(image, origin="lower", aspect="auto", cmap="viridis", norm=norm, interpolation="nearest")
     axes.set_facecolor("#d9d9d9")  # behind cells without a number
-    if slopes.size <= most and payloads.size <= _ROWS:
+    if slopes.size <= max_columns and payloads.size <= _LABELLED_ROWS:
         for j, i in zip(*np.nonzero(np.isfinite(image)), strict=True):
             ink = "white" if norm(image[j, i]) < 0.63 else INK
             axes.text(i, j, reading_text(image[j, i], channel), color=ink, ha="center", va="center", in_layout=False)
-    box, missing = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}, np.isnan(values)
-    for status in np.unique(runs["status"][missing]):  # named in its most central cell
-        cells = np.stack([x, y], 1)[missing & (runs["status"] == status)]
+    text_box = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}
+    is_missing = np.isnan(values)
+    for status in np.unique(runs["status"][is_missing]):  # named in its most central cell
+        cells = np.stack([x, y], 1)[is_missing & (runs["status"] == status)]
         i, j = cells[np.argmin(((cells - cells.mean(0)) ** 2).sum(1))]
         side = "right" if i > 0.88 * slopes.size else "left" if i < 0.12 * slopes.size - 0.5 else "center"
-        axes.text(i, j, words.short_status(str(status)), ha=side, va="center", bbox=box, in_layout=False)
+        axes.text(i, j, words.short_status(str(status)), ha=side, va="center", bbox=text_box, in_layout=False)
     _set_ticks(axes.set_xticks, slopes)
     _set_ticks(axes.set_yticks, payloads)
 
@@ -124,18 +128,22 @@ def _set_ticks(setter: Any, levels: np.ndarray) -> None:
 
 def _draw_lines(runs: Columns, channel: Channel, variable: str) -> Figure:
     """Lines over a `variable`, one for each level of the imposed quantity."""
-    kinds, values = list(dict.fromkeys(runs["configuration"])), _values_with_number(runs, channel)
+    configurations = list(dict.fromkeys(runs["configuration"]))
+    values = _values_with_number(runs, channel)
     lines = [("", np.ones(len(values), bool))] if variable == imposed_column(runs) else _panels_by_imposed(runs)
-    fig, grid = new_figure(1, len(kinds), 3.2, sharey=True)
-    for axes, kind in zip(grid[0], kinds, strict=True):
+    fig, grid = new_figure(1, len(configurations), 3.2, sharey=True)
+    for axes, configuration in zip(grid[0], configurations, strict=True):
         for k, (label, mask) in enumerate(lines):
-            pick = np.flatnonzero(mask & (runs["configuration"] == kind))
-            pick = pick[np.argsort(runs[variable][pick], kind="stable")]
-            x, shade = runs[variable], colormaps["viridis"](0.15 + 0.7 * k / max(1, len(lines) - 1))
-            axes.plot(x[pick], values[pick], "o-" if pick.size <= 60 else "-", ms=4, color=shade, label=label or None)
-        if np.isnan(values[runs["configuration"] == kind]).all():
+            rows = np.flatnonzero(mask & (runs["configuration"] == configuration))
+            rows = rows[np.argsort(runs[variable][rows], kind="stable")]
+            x = runs[variable]
+            colour = colormaps["viridis"](0.15 + 0.7 * k / max(1, len(lines) - 1))
+            axes.plot(
+                x[rows], values[rows], "o-" if rows.size <= 60 else "-", ms=4, color=colour, label=label or None
+            )
+        if np.isnan(values[runs["configuration"] == configuration]).all():
             add_corner_note(axes, "no operating point")
-        axes.set(xlabel=axis_title(variable), title=kind)
+        axes.set(xlabel=axis_title(variable), title=configuration)
         if lines[0][0]:
             axes.legend()
     low, high = 1.1 * np.nanmin(values, initial=0.0), 1.1 * np.nanmax(values, initial=0.0)
@@ -144,8 +152,8 @@ def _draw_lines(runs: Columns, channel: Channel, variable: str) -> Figure:
 
 
 #: Bins of a histogram. Most and fewest bins along a quantity, and points per bin required for more than the fewest.
-BARS, BINS = 40, 24
-LEAST, EACH = 6, 5
+HISTOGRAM_BINS, MAX_BINS = 40, 24
+FEWEST_BINS, POINTS_PER_BIN = 6, 5
 #: Colours of verdicts, in the order of their codes.
 ENDINGS = (GREEN, VERMILION, ORANGE, SKY, PURPLE, FAINT, INK)
 
@@ -158,11 +166,11 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
         label: label with its unit.
         varied: varied quantities by name, at these points.
     """
-    most = sorted(varied.values(), key=lambda quantity: -variance_share(quantity.values, output))[:2]
-    fig, ((histogram, *others),) = new_figure(1, 1 + len(most), 2.9)
-    histogram.hist(output, bins=_number_of_bins(output, BARS), color=BLUE)
+    top_quantities = sorted(varied.values(), key=lambda quantity: -variance_share(quantity.values, output))[:2]
+    fig, ((histogram, *others),) = new_figure(1, 1 + len(top_quantities), 2.9)
+    histogram.hist(output, bins=_number_of_bins(output, HISTOGRAM_BINS), color=BLUE)
     histogram.set(xlabel=label, ylabel="points", title="distribution")
-    for axes, quantity in zip(others, most, strict=True):
+    for axes, quantity in zip(others, top_quantities, strict=True):
         bin_index, middles = bin_values(quantity.values)
         quantiles = np.array([np.quantile(output[bin_index == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
         axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
@@ -195,16 +203,17 @@ def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: VariedQu
     return fig
 
 
-def _number_of_bins(values: np.ndarray, most: int) -> int:
+def _number_of_bins(values: np.ndarray, max_bins: int) -> int:
     """Number of bins for this many values."""
-    return min(most, max(LEAST, len(values) // EACH))
+    return min(max_bins, max(FEWEST_BINS, len(values) // POINTS_PER_BIN))
 
 
 def bin_values(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bin of each value, and the middles of the bins: the levels if there are few, otherwise bins with equal numbers
     of points.
     """
-    levels, number = np.unique(values), _number_of_bins(values, BINS)
+    levels = np.unique(values)
+    number = _number_of_bins(values, MAX_BINS)
     if len(levels) <= number:
         return np.searchsorted(levels, values), levels
     edges = np.unique(np.quantile(values, np.linspace(0, 1, number + 1)))
@@ -221,67 +230,75 @@ def variance_share(values: np.ndarray, output: np.ndarray) -> float:
 
 
 #: Most inputs, and most operating points, in a tornado.
-TALLEST, POINTS = 10, 4
+TORNADO_INPUTS, TORNADO_POINTS = 10, 4
 
 
-def draw_input_shares(found: SensitivityResult) -> Figure:
+def draw_input_shares(result: SensitivityResult) -> Figure:
     """Share of every input in every output, over all operating points together. Cells show their percentage if there
     are few columns.
     """
-    shares = np.stack([study.overall_share for study in found.outputs.values()], 1)
+    shares = np.stack([study.overall_share for study in result.outputs.values()], 1)
     rows = [k for k in np.argsort(-shares.max(1), kind="stable") if shares[k].max() >= NEGLIGIBLE][:14]
     rows = rows or [int(np.argmax(shares.max(1)))]
     shares = shares[rows]
     fig, ((axes,),) = new_figure(1, 1, 0.9 + 0.29 * len(rows))
     axes.grid(False)
-    hidden = np.ma.masked_invalid(np.where(shares < NEGLIGIBLE, 0.0, shares))
-    axes.imshow(np.sqrt(hidden), cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    visible_shares = np.ma.masked_invalid(np.where(shares < NEGLIGIBLE, 0.0, shares))
+    axes.imshow(np.sqrt(visible_shares), cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     axes.set_facecolor("#eeeeee")
     axes.spines[["left", "bottom"]].set_visible(False)
     axes.tick_params(length=0)
     if shares.shape[1] <= 12:
-        for (i, j), x in np.ndenumerate(shares):
-            if np.isfinite(x) and x >= NEGLIGIBLE:
-                axes.text(j, i, f"{100 * x:.0f}", ha="center", va="center", color="white" if x > 0.36 else INK)
-    axes.set_yticks(range(len(rows)), [words.short_name(found.names[k]) for k in rows])
-    axes.set_xticks(range(shares.shape[1]), [s.row.label for s in found.outputs.values()], rotation=18, ha="left")
+        for (i, j), share in np.ndenumerate(shares):
+            if np.isfinite(share) and share >= NEGLIGIBLE:
+                axes.text(
+                    j, i, f"{100 * share:.0f}", ha="center", va="center", color="white" if share > 0.36 else INK
+                )
+    axes.set_yticks(range(len(rows)), [words.short_name(result.names[k]) for k in rows])
+    axes.set_xticks(
+        range(shares.shape[1]), [study.row.label for study in result.outputs.values()], rotation=18, ha="left"
+    )
     axes.xaxis.tick_top()
     return fig
 
 
-def _points_of_tornado(study: OutputStudy, found: SensitivityResult) -> list[int]:
+def _points_of_tornado(study: OutputStudy, result: SensitivityResult) -> list[int]:
     """The gentlest and the hardest operating point of each configuration, and some between."""
-    points, picked = found.points, list[int]()
-    kinds = list(dict.fromkeys(points.configuration))
-    for kind in kinds:
-        rows = np.flatnonzero((points.configuration == kind) & np.isfinite(study.value) & study.studied)
+    points = result.points
+    picked = list[int]()
+    configurations = list(dict.fromkeys(points.configuration))
+    for configuration in configurations:
+        rows = np.flatnonzero((points.configuration == configuration) & np.isfinite(study.value) & study.studied)
         rows = rows[np.lexsort((points.payload[rows], points.slope_deg[rows], points.imposed[1][rows]))]
         if rows.size:
-            spread = np.linspace(0, rows.size - 1, max(POINTS // len(kinds), 1)).astype(int)
-            picked += rows[np.unique(spread)].tolist()
-    return picked[:POINTS]
+            evenly_spaced = np.linspace(0, rows.size - 1, max(TORNADO_POINTS // len(configurations), 1)).astype(int)
+            picked += rows[np.unique(evenly_spaced)].tolist()
+    return picked[:TORNADO_POINTS]
 
 
-def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
+def draw_tornado(study: OutputStudy, result: SensitivityResult) -> Figure:
     """The output with a single input at the ends of its 95 % interval, at a few operating points."""
-    points, unit, factor = _points_of_tornado(study, found), study.row.unit_shown, study.row.factor
-    swing, value = study.swing[:, points] / factor, study.value[points] / factor
-    reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
-    relative = (reach / np.maximum(reach.max(1, keepdims=True), 1e-300)).sum(0)
-    top = [i for i in np.argsort(-relative, kind="stable")[:TALLEST] if relative[i] > 0.03]
-    fig, (panels,) = new_figure(1, max(len(points), 1), 0.9 + 0.26 * len(top), sharey=True)
+    points = _points_of_tornado(study, result)
+    unit = study.row.unit_shown
+    factor = study.row.factor
+    swing = study.swing[:, points] / factor
+    value = study.value[points] / factor
+    largest_change = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
+    relative = (largest_change / np.maximum(largest_change.max(1, keepdims=True), 1e-300)).sum(0)
+    inputs = [i for i in np.argsort(-relative, kind="stable")[:TORNADO_INPUTS] if relative[i] > 0.03]
+    fig, (panels,) = new_figure(1, max(len(points), 1), 0.9 + 0.26 * len(inputs), sharey=True)
     for n, axes in enumerate(panels):
-        for place, i in enumerate(top):
+        for bar_row, i in enumerate(inputs):
             for end, colour in ((swing[0, n, i], VERMILION), (swing[1, n, i], BLUE)):
                 if np.isfinite(end):
-                    axes.barh(-place, end - value[n], left=value[n], color=colour, height=0.66)
+                    axes.barh(-bar_row, end - value[n], left=value[n], color=colour, height=0.66)
                 else:
                     right_end = np.nanmax([value[n], *swing[:, n, i]])
-                    axes.text(right_end, -place, " × does not travel", va="center", color=colour)
+                    axes.text(right_end, -bar_row, " × does not travel", va="center", color=colour)
         axes.axvline(value[n], color=INK, linewidth=0.9)
-        axes.set_title(found.points.label(points[n]).replace(", ", "\n", 1), fontsize=8.5)
+        axes.set_title(result.points.label(points[n]).replace(", ", "\n", 1), fontsize=8.5)
         axes.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])  # few digits, so that numbers do not touch
         axes.grid(axis="y", visible=False)
-    panels[0].set_yticks([-p for p in range(len(top))], [words.short_name(found.names[i]) for i in top])
+    panels[0].set_yticks([-p for p in range(len(inputs))], [words.short_name(result.names[i]) for i in inputs])
     panels[0].set_xlabel(f"{study.row.label}{'' if unit == '-' else f' [{unit}]'}")
     return fig

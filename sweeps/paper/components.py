@@ -26,24 +26,35 @@ def draw_gearbox_efficiency(robots: dict[str, Robot], rows: data.PaperRows | Non
     fig, grid = new_figure(1, 1, 3.9)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
-    gear, top = robot.gearbox, 2.5
+    gear = robot.gearbox
+    largest_torque = 2.5
     if rows is not None:
-        kind, table = rows.conditions["configuration"], rows.raised
-        radius = np.array([float(robot.configurations[str(c)].radius) for c in kind])
+        configurations = rows.conditions["configuration"]
+        table = rows.raised
+        radius = np.array(
+            [float(robot.configurations[str(configuration)].radius) for configuration in configurations]
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             torque = table["power_gear_W"] / robot.sides / (table["theoretical_speed_mm_s"] * MM / radius)
             efficiency = table["power_gear_W"] / table["power_motor_W"]
-        top = max(top, 1.25 * float(np.nanmax(torque)))
-        for c in rows.ratio:
-            marker = "o" if c == TRACKED else "s"
-            label = f"the measured conditions, {c}"
-            axes.plot(torque[kind == c], efficiency[kind == c], marker, ms=5, color=CONFIGURATION[c], label=label)
-    for volts, rpm, line in ((15, 5000.0, "-"), (33, 11_500.0, "--")):  # approximate speeds of the measured rows
-        transmitted = jnp.geomspace(1e-5, top / float(gear.ratio * gear.efficiency_load), 300)
+        largest_torque = max(largest_torque, 1.25 * float(np.nanmax(torque)))
+        for configuration in rows.ratio:
+            marker = "o" if configuration == TRACKED else "s"
+            label = f"the measured conditions, {configuration}"
+            axes.plot(
+                torque[configurations == configuration],
+                efficiency[configurations == configuration],
+                marker,
+                ms=5,
+                color=CONFIGURATION[configuration],
+                label=label,
+            )
+    for volts, rpm, style in ((15, 5000.0, "-"), (33, 11_500.0, "--")):  # approximate speeds of the measured rows
+        transmitted = jnp.geomspace(1e-5, largest_torque / float(gear.ratio * gear.efficiency_load), 300)
         efficiencies = gear.efficiency(transmitted + gear.torque_idle(rpm * RPM, 1.0), rpm * RPM)
         label = f"{displayed_robot_name(name)}, {rpm:,.0f} rpm (about {volts} V)"
         axes.plot(
-            gear.torque_output(transmitted, 1.0), efficiencies, line, color=MODEL.get(name, PURPLE), label=label
+            gear.torque_output(transmitted, 1.0), efficiencies, style, color=MODEL.get(name, PURPLE), label=label
         )
     limit = float(gear.efficiency_load)
     axes.axhline(limit, color=FAINT, lw=0.9, ls=":", label=f"limit at high load $\\eta_{{rm}}$ = {limit:.2f}")
@@ -51,7 +62,7 @@ def draw_gearbox_efficiency(robots: dict[str, Robot], rows: data.PaperRows | Non
     axes.axhline(constant, color=MODEL["sm1"], lw=1.6, label=f"{CONSTANTS}: {constant:.2f}")
     axes.legend(loc="lower right")
     axes.set(xlabel="torque at the gearbox output, one side [N·m]", ylabel=r"efficiency $\eta_r$ [-]")
-    axes.set(xlim=(0, top), ylim=(0, 0.9))
+    axes.set(xlim=(0, largest_torque), ylim=(0, 0.9))
     return fig
 
 
@@ -59,14 +70,15 @@ def draw_battery(robots: dict[str, Robot]) -> Figure:
     """Fig. 10: cell voltage over load current I_b (12), and no-load voltage over discharge (13) with the capacity."""
     fig, grid = new_figure(1, 2, 3.7)
     name, robot = next(iter(robots.items()))
-    colour, battery = MODEL.get(name, PURPLE), robot.battery
+    colour = MODEL.get(name, PURPLE)
+    battery = robot.battery
     current = jnp.linspace(0, 12, 50)
     left, right = grid[0]
-    for words, share, line in (("full", 0.0, "-"), ("half discharged", 0.5, "--"), ("at capacity", 1.0, ":")):
+    for charge_label, share, style in (("full", 0.0, "-"), ("half discharged", 0.5, "--"), ("at capacity", 1.0, ":")):
         volts = battery.voltage(current - battery.current_other, share * battery.capacity) / battery.cells
-        left.plot(current, volts, line, color=colour, label=words)
-    constant = robots[CONSTANT].battery
-    volts = constant.voltage(current - constant.current_other, 0.0) / constant.cells
+        left.plot(current, volts, style, color=colour, label=charge_label)
+    constant_battery = robots[CONSTANT].battery
+    volts = constant_battery.voltage(current - constant_battery.current_other, 0.0) / constant_battery.cells
     left.plot(current, volts, color=MODEL["sm1"], label=CONSTANTS)
     left.set(xlabel="load current $I_b$ [A]", ylabel="cell voltage [V]", xlim=(0, 12))
     left.set_title(f"a) cell under load: R = {float(battery.resistance) * 1e3:.0f} mΩ a cell")
@@ -91,9 +103,10 @@ def draw_battery(robots: dict[str, Robot]) -> Figure:
 def draw_motor_friction(robots: dict[str, Robot]) -> Figure:
     """Fig. 11: motor friction torque (14) over speed, with the maker's no-load point."""
     fig, grid = new_figure(1, 1, 3.4)
-    axes, motor = grid[0, 0], next(iter(robots.values())).motor
+    axes = grid[0, 0]
+    motor = next(iter(robots.values())).motor
     rpm = jnp.linspace(0, 12_500, 60)
-    for name in (name for name in robots if name != "sm1"):  # whose curve is that of SM-2
+    for name in (name for name in robots if name != "sm1"):  # SM-1 has the same curve as SM-2
         torque = 1e3 * np.broadcast_to(robots[name].motor.torque_loss(rpm * RPM, 1.0), rpm.shape)
         label = CONSTANTS if name == CONSTANT else displayed_robot_name(name)
         axes.plot(rpm, torque, color=MODEL.get(name, PURPLE), label=label)
@@ -115,16 +128,23 @@ def draw_idle_track(robots: dict[str, Robot]) -> Figure:
     name, robot = next(iter(robots.items()))
     speed = np.linspace(0.5, 26.0, 60)
     labels = {TRACKED: "three tracks a side", WHEELED: "one track a side"}
-    for kind in data.shown_configurations(robot):
-        current, colour = data.idle_current(robot, kind, speed), CONFIGURATION.get(kind, PURPLE)
-        line, certainty = data.fit_line(speed, current)
-        words = f"{labels[kind]} ({kind})" if kind in labels else kind
+    for configuration in data.shown_configurations(robot):
+        current = data.idle_current(robot, configuration, speed)
+        colour = CONFIGURATION.get(configuration, PURPLE)
+        line, r_squared = data.fit_line(speed, current)
+        description = f"{labels[configuration]} ({configuration})" if configuration in labels else configuration
         axes.plot(speed[::4], current[::4], "o", color=colour, ms=4)
-        axes.plot(speed, line, color=colour, label=f"{displayed_robot_name(name)}, {words}: R² = {certainty:.4f}")
-    for other in ("sm1", "sm2"):
-        current = data.idle_current(robots[other], TRACKED, speed)
         axes.plot(
-            speed, current, color=MODEL[other], lw=1.4, label=f"{displayed_robot_name(other)}, {labels[TRACKED]}"
+            speed, line, color=colour, label=f"{displayed_robot_name(name)}, {description}: R² = {r_squared:.4f}"
+        )
+    for other_name in ("sm1", "sm2"):
+        current = data.idle_current(robots[other_name], TRACKED, speed)
+        axes.plot(
+            speed,
+            current,
+            color=MODEL[other_name],
+            lw=1.4,
+            label=f"{displayed_robot_name(other_name)}, {labels[TRACKED]}",
         )
     axes.set(xlabel="pulley speed [rad/s]", ylabel="current of one motor [A]", xlim=(0, 26), ylim=(0, None))
     axes.legend()

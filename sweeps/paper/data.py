@@ -21,10 +21,12 @@ from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures
 from sweeps.pages.history_figures import StartRun
 
-_CHUNK = 256  # one compiled shape for all calls of `steady` in the report
-#: Surface of Table 5 that stands for "adhesion raised": the first on which all 20 measured rows climb.
+#: Runs per call of `steady`, so that all calls of the report share one compiled program.
+_CHUNK = 256
+#: Surface of Table 5 for "adhesion raised": the first on which all 20 measured rows climb.
 RAISED_SURFACE = "smooth_concrete_floor"
-RAISED_MARGIN = 1.06  # if that is not enough for a robot: smallest ratio of adhesion to the largest demand
+#: Smallest ratio of the raised adhesion to the largest demand, for robots that need more than this surface.
+RAISED_MARGIN = 1.06
 FIG_23, FIG_24 = "Fig. 23: total current", r"Fig. 24: $V_x$ and $V_{x\,teor}$"  # titles
 #: Loading modes of Fig. 28: supply voltage [V] and payload [kg].
 MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
@@ -40,26 +42,26 @@ def shown_configurations(robot: Robot) -> Names:
     return paper_configurations(robot) or robot.configurations.names
 
 
-def batch_conditions(robot: Robot, configuration: Any, **given: Any) -> Conditions:
+def batch_conditions(robot: Robot, configuration: Any, **values: Any) -> Conditions:
     """Batch of conditions with configurations by name. The default total mass is that of the robot."""
-    conditions = Conditions(np.asarray(configuration), **given).resolved(robot)
+    conditions = Conditions(np.asarray(configuration), **values).resolved(robot)
     if conditions.total_mass is not None:
         return conditions
-    own_mass = np.array([float(chassis.mass) for chassis in robot.configurations.members])
+    unloaded_mass = np.array([float(chassis.mass) for chassis in robot.configurations.members])
     return dataclasses.replace(
-        conditions, total_mass=own_mass[np.asarray(conditions.configuration)] + conditions.payload
+        conditions, total_mass=unloaded_mass[np.asarray(conditions.configuration)] + conditions.payload
     )
 
 
-def operating_points(robot: Robot, asked: Conditions) -> Columns:
+def operating_points(robot: Robot, conditions: Conditions) -> Columns:
     """Steady operating points of a batch, in the columns of `runs.csv`."""
-    rows = asked.shape[0]
+    rows = conditions.shape[0]
     parts = []
     for first in range(0, rows, _CHUNK):
         index = np.minimum(np.arange(first, first + _CHUNK), rows - 1)
-        parts.append(jax.device_get(steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], asked))))
-    answer = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
-    return {**outputs.output_columns(answer, robot.channels), "total_mass_kg": answer.mass}
+        parts.append(jax.device_get(steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], conditions))))
+    results = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
+    return {**outputs.output_columns(results, robot.channels), "total_mass_kg": results.mass}
 
 
 def channels_of_paper() -> tuple[Channel, ...]:
@@ -112,9 +114,9 @@ def simulate_measured_rows(robot: Robot) -> PaperRows | None:
         table.where(np.isin(table["configuration"], paper_configurations(robot)))
         for table in map(runs.read_runs, ("measured", "simulated_by_paper"))
     )
-    kind = table["configuration"]
+    configurations = table["configuration"]
     request: Json = {
-        "configuration": kind,
+        "configuration": configurations,
         "voltage": table["supply_voltage_V"],
         "payload": table["payload_kg"],
         "slope_deg": table["slope_deg"],
@@ -123,10 +125,10 @@ def simulate_measured_rows(robot: Robot) -> PaperRows | None:
     plain = operating_points(robot, batch_conditions(robot, total_mass=mass, **request))
     ratio = {}
     for c in paper_configurations(robot):
-        largest = float(np.max(np.abs(plain["adhesion_used"][kind == c])))
+        largest_use = float(np.max(np.abs(plain["adhesion_used"][configurations == c])))
         surface_ratio = adhesion_ratio(RAISED_SURFACE, c == TRACKED)
-        ratio[c] = max(surface_ratio, RAISED_MARGIN * largest) if largest > 1 else 1.0
-    adhesion = np.array([ratio[c] for c in kind])
+        ratio[c] = max(surface_ratio, RAISED_MARGIN * largest_use) if largest_use > 1 else 1.0
+    adhesion = np.array([ratio[c] for c in configurations])
     raised = operating_points(robot, batch_conditions(robot, total_mass=mass, adhesion=adhesion, **request))
     weighed = operating_points(robot, batch_conditions(robot, adhesion=adhesion, **request))
     return PaperRows(
@@ -138,14 +140,14 @@ def raised_adhesion_words(robot: Robot, ratio: dict[str, float]) -> str:
     """Raised adhesion coefficients in words, with their source."""
     surface = SURFACES[RAISED_SURFACE]
     parts = []
-    for c, raised in ratio.items():
-        own_friction = float(robot.configurations[c].ground.friction.static)
-        if raised == 1.0:
-            parts.append(f"{c} unchanged at {own_friction:.2f}")
+    for c, factor in ratio.items():
+        adhesion = float(robot.configurations[c].ground.friction.static)
+        if factor == 1.0:
+            parts.append(f"{c} unchanged at {adhesion:.2f}")
             continue
-        table_value = surface.tracked_x if c == TRACKED else surface.wheeled_x
-        table = " (Table 5, smooth concrete floor)" if abs(own_friction * raised - table_value) < 1e-6 else ""
-        parts.append(f"{c} from {own_friction:.2f} to {own_friction * raised:.2f}{table}")
+        printed_adhesion = surface.tracked_x if c == TRACKED else surface.wheeled_x
+        source_text = " (Table 5, smooth concrete floor)" if abs(adhesion * factor - printed_adhesion) < 1e-6 else ""
+        parts.append(f"{c} from {adhesion:.2f} to {adhesion * factor:.2f}{source_text}")
     return "; ".join(parts)
 
 
@@ -211,13 +213,14 @@ def starts_from_standstill(robot: Robot, history: Any, status: Any) -> list[Star
 
 def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:
     """Current [A] over slope for the loading modes: (configuration, mode) → (own adhesion, raised)."""
-    cases = [(c, mode, r) for c in ratio for mode in MODES for r in (1.0, ratio[c])]
-    kind, voltage, payload, adhesion = (
-        np.repeat(np.array(v), len(slopes)) for v in zip(*((c, *MODES[mode], r) for c, mode, r in cases), strict=True)
+    cases = [(c, mode, factor) for c in ratio for mode in MODES for factor in (1.0, ratio[c])]
+    configuration, voltage, payload, adhesion = (
+        np.repeat(np.array(values), len(slopes))
+        for values in zip(*((c, *MODES[mode], factor) for c, mode, factor in cases), strict=True)
     )
     conditions = batch_conditions(
         robot,
-        kind,
+        configuration,
         voltage=voltage.astype(float),
         payload=payload.astype(float),
         slope_deg=np.tile(slopes, len(cases)),
@@ -227,11 +230,14 @@ def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray
     return {(c, mode): (current[2 * k], current[2 * k + 1]) for k, (c, mode, _) in enumerate(cases[::2])}
 
 
-def rows_of_mode(rows: PaperRows, kind: str, mode: int) -> np.ndarray:
+def rows_of_mode(rows: PaperRows, configuration: str, mode: int) -> np.ndarray:
     """Mask of the measured rows of a configuration in a loading mode."""
-    table, (voltage, payload) = rows.conditions, MODES[mode]
+    table = rows.conditions
+    (voltage, payload) = MODES[mode]
     return np.asarray(
-        (table["configuration"] == kind) & (table["supply_voltage_V"] == voltage) & (table["payload_kg"] == payload)
+        (table["configuration"] == configuration)
+        & (table["supply_voltage_V"] == voltage)
+        & (table["payload_kg"] == payload)
     )
 
 
@@ -242,46 +248,50 @@ def slope_certainty(rows: PaperRows) -> list[tuple[Any, ...]]:
         Configuration, mode, R² of a straight line through the points, and R² of the robot with its own adhesion.
         Then the number of rows that settle with it, and R² with raised adhesion and with the robot's own mass.
     """
-    found = []
-    for kind in rows.ratio:
+    table_rows = []
+    for configuration in rows.ratio:
         for mode in MODES:
-            pick = rows_of_mode(rows, kind, mode)
-            if pick.any():
-                measured = rows.measured[pick, 0]
-                own, *others = (t["total_current_A"][pick] for t in (rows.plain, rows.raised, rows.weighed))
-                straight = fit_line(rows.conditions["slope_deg"][pick], measured)[1]
-                found.append(
+            is_row = rows_of_mode(rows, configuration, mode)
+            if is_row.any():
+                measured = rows.measured[is_row, 0]
+                plain, *others = (
+                    table["total_current_A"][is_row] for table in (rows.plain, rows.raised, rows.weighed)
+                )
+                line_r_squared = fit_line(rows.conditions["slope_deg"][is_row], measured)[1]
+                table_rows.append(
                     (
-                        kind, mode, straight, simulation_errors.r_squared(measured, own),
-                        int(np.isfinite(own).sum()), *(simulation_errors.r_squared(measured, x) for x in others),
+                        configuration, mode, line_r_squared, simulation_errors.r_squared(measured, plain),
+                        int(np.isfinite(plain).sum()), *(simulation_errors.r_squared(measured, x) for x in others),
                     )
                 )  # fmt: skip
-    return found
+    return table_rows
 
 
 def supply_errors(robot: Robot, rows: PaperRows, voltage: float, battery: bool) -> np.ndarray:
     """Errors (35) over the five slopes of 6T2A at a voltage of Fig. 29, with raised adhesion, shape (5, 3)."""
-    pick = (rows.conditions["configuration"] == TRACKED) & (rows.conditions["supply_voltage_V"] == voltage)
-    table = rows.conditions.where(pick)
+    is_row = (rows.conditions["configuration"] == TRACKED) & (rows.conditions["supply_voltage_V"] == voltage)
+    table = rows.conditions.where(is_row)
     conditions = batch_conditions(
         robot, table["configuration"], voltage=voltage, payload=table["payload_kg"],
         slope_deg=table["slope_deg"], total_mass=table["total_mass_kg"], adhesion=rows.ratio[TRACKED],
         battery=float(battery),
     )  # fmt: skip
-    return simulation_errors.relative_error(stack_channels(operating_points(robot, conditions)), rows.measured[pick])
+    return simulation_errors.relative_error(
+        stack_channels(operating_points(robot, conditions)), rows.measured[is_row]
+    )
 
 
 #: Uses of the supply's power, from the motor to the ground, with their names in the figure.
 SPLIT = ("winding", "motor friction", "gearbox", "track and guides", "slip", "rolling resistance", "lift")
 
 
-def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
+def energy_split(robot: Robot, conditions: Conditions) -> tuple[Columns, Columns]:
     """Operating points, and the power [W] of each item of `SPLIT`.
 
     Returns:
         Points, and item → power. `other` is the power of effects beyond the paper's terms.
     """
-    points, (_, signals) = operating_points(robot, asked), results_of_rows(robot, asked)
+    points, (_, signals) = operating_points(robot, conditions), results_of_rows(robot, conditions)
     sides = robot.sides
     parts = {
         "winding": sides * signals.voltage_drop * signals.current,
@@ -306,17 +316,17 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> list[tuple[Any, ...]]:
         ratio: factor by which adhesion is raised if the robot would slide, by configuration.
     """
     cases = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
-    kind, voltage, payload, slope = (np.array(v) for v in zip(*cases, strict=True))
+    configurations, voltage, payload, slope = (np.array(values) for values in zip(*cases, strict=True))
 
-    def at(adhesion: np.ndarray) -> tuple[Columns, Columns]:
-        given = {"voltage": voltage, "payload": payload, "slope_deg": slope, "adhesion": adhesion}
-        return energy_split(robot, batch_conditions(robot, kind, **given))
+    def points_and_power(adhesion: np.ndarray) -> tuple[Columns, Columns]:
+        quantities = {"voltage": voltage, "payload": payload, "slope_deg": slope, "adhesion": adhesion}
+        return energy_split(robot, batch_conditions(robot, configurations, **quantities))
 
-    is_sliding = at(np.ones(len(cases)))[0]["status"] == "slides"
-    points, power = at(np.where(is_sliding, [ratio[k] for k in kind], 1.0))
+    slides = points_and_power(np.ones(len(cases)))[0]["status"] == "slides"
+    points, power = points_and_power(np.where(slides, [ratio[k] for k in configurations], 1.0))
     return [
         (
-            f"{c}  {u:.0f} V  {p:.0f} kg  {s:.0f}°" + " *" * bool(is_sliding[k]),
+            f"{c}  {u:.0f} V  {p:.0f} kg  {s:.0f}°" + " *" * bool(slides[k]),
             *(watts[k] for watts in (points["power_supply_W"], *(power[item] for item in SPLIT))),
         )
         for k, (c, u, p, s) in enumerate(cases)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.data import Json, Names
-from calibration.data.columns import IMPOSED as OF_IMPOSED
+from calibration.data.columns import IMPOSED as IMPOSED_COLUMNS
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import reason_without_levers
 from calibration.data.input_errors import (
@@ -36,10 +36,10 @@ from sweeps.points.tasks import task_of_configuration
 CONFIGURATION, SURFACE = "configuration", "surface"
 #: Conditions that act only on vehicles, and only on loads on a shaft.
 ON_GROUND, ON_SHAFT = ("slope_deg", "payload", "total_mass", "adhesion"), ("load_torque",)
-#: Most values of one axis, which are kept in memory, unlike samples.
-LONGEST = 10_000_000
-#: Most points. The numbers of more points would exceed 64 bits.
-MOST = 2**62
+#: Maximum number of values of one axis. They are kept in memory, unlike samples.
+MAX_AXIS_VALUES = 10_000_000
+#: Maximum number of points. Their numbers have 64 bits.
+MAX_POINTS = 2**62
 
 Quantile = Callable[[np.ndarray], np.ndarray]
 
@@ -101,11 +101,14 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
         raise BadConfiguration(f"{where}: no [axes] or [samples]; vary at least one quantity")
     design = Design(axes, samples)
     fixed, surface = _fixed_conditions(config.conditions, robot, f"{where}, conditions")
-    fixed |= task.further({**{name: np.array([value]) for name, value in fixed.items()}, **axes}, robot, where)
+    fixed |= task.added_conditions(
+        {**{name: np.array([value]) for name, value in fixed.items()}, **axes}, robot, where
+    )
     for k, name in enumerate(design.names):
         if name in fixed or name in design.names[:k]:
             raise BadConfiguration(f"{where}, {name}: given twice; give it once, under conditions, axes or samples")
-    names, on_battery = {*fixed, *design.names}, fixed.get("battery", 0.0) > 0.5
+    names = {*fixed, *design.names}
+    on_battery = fixed.get("battery", 0.0) > 0.5
     if on_battery and "voltage" in names:
         raise BadConfiguration(f"{where}: voltage has no effect on a battery; remove one of the two")
     _check_acting_conditions(names, robot, where, surface)
@@ -113,38 +116,41 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
     configuration_names = [robot.configurations.names[int(k)] for k in configuration_indices]
     capabilities.check_turning(robot, names, configuration_names, where)
     for name in configuration_names if not names.isdisjoint(LEVERS) else ():
-        if why := reason_without_levers(robot, name):
-            raise BadConfiguration(f"{where}, {min(names & {*LEVERS})}: {why}")
-    own_axis = robot.rig.imposed
-    if not robot.rig.inherits and own_axis not in names and not on_battery:
-        level = capabilities.imposed_default(robot, f"{where}, conditions.{own_axis}")
-        fixed[own_axis] = level * OF_IMPOSED[own_axis][1]
+        if reason := reason_without_levers(robot, name):
+            raise BadConfiguration(f"{where}, {min(names & {*LEVERS})}: {reason}")
+    imposed_axis = robot.rig.imposed
+    if not robot.rig.inherits and imposed_axis not in names and not on_battery:
+        default = capabilities.imposed_default(robot, f"{where}, conditions.{imposed_axis}")
+        fixed[imposed_axis] = default * IMPOSED_COLUMNS[imposed_axis][1]
     if surface is not None and "adhesion" in names:
         raise BadConfiguration(
             f"{where}, conditions.surface: got {surface} in addition to adhesion; give one of the two"
         )
-    if design.points > MOST:
-        raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
+    if design.points > MAX_POINTS:
+        raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MAX_POINTS:.3g}")
     plan = SweepPlan(design, dict(task.axes), fixed, surface, data)
-    varied = {**task.axes, **plan.varied(robot).axes}
-    return dataclasses.replace(plan, axes={name: varied[name] for name in design.names})
+    all_axes = {**task.axes, **plan.varied(robot).axes}
+    return dataclasses.replace(plan, axes={name: all_axes[name] for name in design.names})
 
 
 def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
     """Rejects conditions that do not act on the robot."""
-    kinds = {
+    axes_of_imposed = {
         "voltage": ("voltage", "duty", "open"), "motor_speed": ("motor_speed", "motor_acceleration"),
         "motor_current": ("motor_current",),
     }  # fmt: skip
-    idle = {name for kind, of_kind in kinds.items() if kind != robot.rig.imposed for name in of_kind}
-    for name in sorted(names & idle):
+    inapplicable = {
+        name for imposed, axis_names in axes_of_imposed.items() if imposed != robot.rig.imposed for name in axis_names
+    }
+    for name in sorted(names & inapplicable):
         raise BadConfiguration(
             f"{where}, {name}: the robot's file imposes the {robot.rig.imposed.replace('_', ' ')}; vary "
             f"{robot.rig.imposed} instead"
         )
-    named = {*names, *([SURFACE] if surface is not None else [])}
+    stated_names = {*names, *([SURFACE] if surface is not None else [])}
     ground, shaft = (
-        [f"{where}, {name}" for name in sorted(named & {*those})] for those in ((*ON_GROUND, SURFACE), ON_SHAFT)
+        [f"{where}, {name}" for name in sorted(stated_names & {*acting})]
+        for acting in ((*ON_GROUND, SURFACE), ON_SHAFT)
     )
     capabilities.check_acting(robot, ground, shaft)
     if surface is not None and not robot.rig.scales_adhesion:
@@ -154,7 +160,7 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
         )
 
 
-def _known_axis(name: str, robot: Robot, where: str) -> Axis:
+def _find_axis(name: str, robot: Robot, where: str) -> Axis:
     names = variation.variable_names(robot)
     stated_word(name, names, where, "neither a parameter of the robot nor a condition", 3)
     return variation.Variation(robot, (name,)).axes[name]
@@ -173,23 +179,23 @@ def _check_within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> No
 
 
 def _configuration(name: Any, robot: Robot, where: str) -> float:
-    wrong = f"got {name!r}; the robot has no such configuration"
-    return float(robot.configurations.index(stated_word(name, robot.configurations, where, wrong)))
+    problem = f"got {name!r}; the robot has no such configuration"
+    return float(robot.configurations.index(stated_word(name, robot.configurations, where, problem)))
 
 
 # --- grids ------------------------------------------------------------------------------------------------------
 
 
-def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, Axis]) -> np.ndarray:
-    axis = extra[name] if name in extra else _known_axis(name, robot, where)
-    several = stated if isinstance(stated, list) else [stated]
+def _axis_values(name: str, stated: Any, robot: Robot, where: str, task_axes: Mapping[str, Axis]) -> np.ndarray:
+    axis = task_axes[name] if name in task_axes else _find_axis(name, robot, where)
+    entries = stated if isinstance(stated, list) else [stated]
     if name == CONFIGURATION:
-        names = robot.configurations.names if stated == "all" else several
-        values = np.array([_configuration(n, robot, where) for n in names])
+        names = robot.configurations.names if stated == "all" else entries
+        values = np.array([_configuration(entry, robot, where) for entry in names])
     elif isinstance(stated, dict):
-        _check_keys(stated, _RANGE, ("start", "stop", "number"), where)
+        _check_keys(stated, _RANGE_KEYS, ("start", "stop", "number"), where)
         start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
-        number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
+        number = stated_count(stated["number"], f"{where}.number", 1, MAX_AXIS_VALUES)
         scale = stated.get("scale", "linear")
         stated_word(scale, ("linear", "log"), f"{where}.scale", f"got {scale!r}")
         if start > stop or (start == stop) != (number == 1):
@@ -203,18 +209,20 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
     elif isinstance(stated, str):
         values = np.array(parse_axis(where, stated))
     else:
-        values = np.array([_axis_value(name, v, where) for v in several])
+        values = np.array([_axis_value(name, entry, where) for entry in entries])
     if not len(values):
         raise BadConfiguration(f"{where}: got no values; expected at least one")
-    if len(values) > LONGEST:
-        raise BadConfiguration(f"{where}: got {len(values)} values; expected at most {LONGEST} (except in [samples])")
+    if len(values) > MAX_AXIS_VALUES:
+        raise BadConfiguration(
+            f"{where}: got {len(values)} values; expected at most {MAX_AXIS_VALUES} (except in [samples])"
+        )
     if len(np.unique(values)) < len(values):
         raise BadConfiguration(f"{where}: got a value twice; give it once")
     _check_within(values, axis, where)
     return values
 
 
-_RANGE = ("start", "stop", "number", "scale")
+_RANGE_KEYS = ("start", "stop", "number", "scale")
 
 
 def _check_keys(stated: Json, allowed: Names, needed: Names, where: str) -> None:
@@ -242,38 +250,42 @@ def _fixed_conditions(stated: Json, robot: Robot, where: str) -> tuple[dict[str,
             fixed[name] = _configuration(value, robot, place)
         else:
             fixed[name] = _axis_value(name, value, place)
-            _check_within(np.array([fixed[name]]), _known_axis(name, robot, place), place)
+            _check_within(np.array([fixed[name]]), _find_axis(name, robot, place), place)
     return fixed, surface
 
 
 # --- samples ----------------------------------------------------------------------------------------------------
 
-_SAMPLES = ("design", "number", "seed", "over", "posterior")
+_SAMPLE_KEYS = ("design", "number", "seed", "over", "posterior")
 
 
 def _sampled_design(stated: Json, robot: Robot, where: str) -> tuple[Samples | None, Names]:
     """Sampled design, if any, and its input files."""
     if not stated:
         return None, ()
-    _check_keys(stated, _SAMPLES, ("design", "number"), where)
+    _check_keys(stated, _SAMPLE_KEYS, ("design", "number"), where)
     design = stated_word(stated["design"], DESIGNS, f"{where}.design", f"got {stated['design']!r}")
     number = stated_count(stated["number"], f"{where}.number", 1, 2**52)
     seed = stated_count(stated.get("seed", 0), f"{where}.seed", 0, SEEDS)
     overrides = stated.get("over", {})
     if not isinstance(overrides, dict):
         raise BadConfiguration(f"{where}.over: got {overrides!r}; expected a table of names and distributions")
-    marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in overrides.items()}
-    joint, data = None, Names()
+    marginals = {
+        name: _quantile(name, distribution, robot, f"{where}.over.{name}") for name, distribution in overrides.items()
+    }
+    joint = None
+    data = Names()
     if "posterior" in stated:
         from calibration.data import posterior_file
 
-        folder, place = stated["posterior"], f"{where}.posterior"
+        folder = stated["posterior"]
+        posterior_place = f"{where}.posterior"
         if not isinstance(folder, str):
-            raise BadConfiguration(f"{place}: got {folder!r}; expected a run folder of calibrate or loop")
+            raise BadConfiguration(f"{posterior_place}: got {folder!r}; expected a run folder of calibrate or loop")
         path = Path(folder)
         path = path / posterior_file.FILE if path.is_dir() else path
         joint = posterior_file.read_posterior(path)
-        joint.check(robot, place)
+        joint.check(robot, posterior_place)
         data = (str(path),)
     if not marginals and joint is None:
         raise BadConfiguration(
@@ -295,7 +307,7 @@ DISTRIBUTIONS: dict[str, Names] = {
 
 def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     """Quantile function of a distribution, truncated at the bounds of the sampled quantity."""
-    axis = _known_axis(name, robot, where)
+    axis = _find_axis(name, robot, where)
     if name == CONFIGURATION:
         raise BadConfiguration(f"{where}: cannot be sampled; put it under axes or conditions")
     table = {"distribution": stated} if isinstance(stated, str) else stated
@@ -306,8 +318,8 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     numbers = {key: stated_number(table[key], f"{where}.{key}") for key in needed}
     ordered = [numbers[key] for key in ("low", "mode", "high") if key in numbers]
     if ordered != sorted(ordered) or (ordered and ordered[0] == ordered[-1]):
-        numbers_text = ", ".join(f"{key} {value:g}" for key, value in numbers.items())
-        raise BadConfiguration(f"{where}: got {numbers_text}; expected {' below '.join(k for k in needed)}")
+        stated_text = ", ".join(f"{key} {value:g}" for key, value in numbers.items())
+        raise BadConfiguration(f"{where}: got {stated_text}; expected {' below '.join(k for k in needed)}")
     for key in ("sd", "sd_log"):
         if numbers.get(key, 1.0) <= 0:
             raise BadConfiguration(f"{where}.{key}: got {numbers[key]:g}; expected more than 0")
@@ -322,10 +334,10 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
 
         coordinates = priors.parameter_coordinates(robot, [name])
         return lambda u: in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]
-    return _truncate(kind, numbers, axis.bounds, where)
+    return _truncated_quantile(kind, numbers, axis.bounds, where)
 
 
-def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:
+def _truncated_quantile(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:
     from scipy.special import ndtr, ndtri
 
     positive = {"loguniform": "low", "lognormal": "median"}.get(kind)
@@ -340,9 +352,9 @@ def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float],
         return lambda u: low * np.exp(u * math.log(high / low))
     if kind == "triangular":
         low, mode, high = numbers["low"], numbers["mode"], numbers["high"]
-        rise = (mode - low) / (high - low)
+        mode_probability = (mode - low) / (high - low)
         return lambda u: np.where(
-            u < rise,
+            u < mode_probability,
             low + np.sqrt(u * (high - low) * (mode - low)),
             high - np.sqrt((1 - u) * (high - low) * (high - mode)),
         )

@@ -36,21 +36,21 @@ def resolve_grid(config: G, robot: Robot, battery: bool, notes: list[str] | None
     """Grid with values for every axis of the robot.
 
     Defaults for the packaged robot are the imposed quantities, payloads and slopes of Table 8. For a rig they are
-    thirds of its limit (`sweeps.points.imposed`), no payload and level ground.
+    thirds of its limit (`capabilities.imposed_levels`), no payload and level ground.
 
     Args:
         battery: True if the runs are on the battery, which removes the axis of voltages.
-        notes: callback for a sentence on values that follow from a rig's limits.
+        notes: list to which a sentence on values that follow from a rig's limit is added.
 
     Raises:
         BadConfiguration: the robot lacks an axis, an axis is neither stated nor determined by a limit, or a surface
             or configuration is unknown.
     """
     layout = Layout.of(robot)
-    own_axis = AXIS[layout.imposed]
+    imposed_axis = AXIS[layout.imposed]
     for key in AXIS.values():
-        if key != own_axis and getattr(config, key) is not None:
-            raise BadConfiguration(capabilities.option_refusal(robot, OPTIONS[key], OPTIONS[own_axis]))
+        if key != imposed_axis and getattr(config, key) is not None:
+            raise BadConfiguration(capabilities.option_refusal(robot, OPTIONS[key], OPTIONS[imposed_axis]))
     ground, shaft = (
         [OPTIONS[key] for key in keys if getattr(config, key) is not None] for keys in (ON_GROUND, ON_SHAFT)
     )
@@ -61,8 +61,8 @@ def resolve_grid(config: G, robot: Robot, battery: bool, notes: list[str] | None
     update: dict[str, object] = {"configurations": grid_configurations(config, robot)}
     if battery:
         capabilities.check_battery(robot)
-    elif getattr(config, own_axis) is None:
-        update[own_axis] = capabilities.imposed_levels(robot, OPTIONS[own_axis], notes)
+    elif getattr(config, imposed_axis) is None:
+        update[imposed_axis] = capabilities.imposed_levels(robot, OPTIONS[imposed_axis], notes)
     if robot.has_ground:
         inherits = robot.rig.inherits
         update |= {

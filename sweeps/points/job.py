@@ -29,10 +29,10 @@ from sweeps.points.tasks import Task, task_of_configuration
 from sweeps.points.zarr_store import ABSENT, StoreLayout
 
 #: Number of points that the fidelity checks before the first one is simulated.
-ASKED = 48
+CHECKED_POINTS = 48
 
 
-def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
+def robot_for_turns(robot: Robot, conditions: Collection[str]) -> Robot:
     """Robot with instruments for both sides and yaw, if conditions of these names let it turn."""
     return robot if set(OF_TURNS).isdisjoint(conditions) else robot.showing_turns()
 
@@ -45,14 +45,17 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str
     """
     profile = None if config.profile is None else _profile(config.profile, robot, plan, where)
     task = task_of_configuration(config, robot, profile is not None and profile.turns)
-    rests = {**{o.name: o.rests_on for o in outputs.output_table(robot.channels)}, **capabilities.RESTS_ON}
+    needed_parameters = {
+        **{o.name: o.rests_on for o in outputs.output_table(robot.channels)},
+        **capabilities.RESTS_ON,
+    }
     for name in config.outputs:
         if config.outputs.count(name) > 1:
             raise BadConfiguration(f"{where}, outputs: got {name} twice; expected each once")
         if name in plan.design.names:
             raise BadConfiguration(f"{where}, outputs: got {name}, which is varied; expected outputs of a run")
         stated_word(name, task.attributes, f"{where}, outputs", most=3)
-        if lacking := [n for n in robot.unknown(rests.get(name, ())) if n not in plan.design.names]:
+        if lacking := [n for n in robot.unknown(needed_parameters.get(name, ())) if n not in plan.design.names]:
             raise BadConfiguration(
                 f"{where}, outputs: {name} cannot be computed, because the robot's file lacks {' and '.join(lacking)}"
             )
@@ -98,10 +101,10 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan)
     """
     fidelity = fidelities.get_fidelity(task.model)
     shape = plan.design.shape
-    ends = itertools.product(*({0, n - 1} for n in shape[:4]))
-    corners = [(*end, *(0 for _ in shape[4:])) for end in ends]
-    spread = np.linspace(0, plan.design.points - 1, ASKED).astype(np.int64)
-    numbers = np.unique([*spread, *(int(np.ravel_multi_index(c, shape)) for c in corners)])
+    corner_starts = itertools.product(*({0, n - 1} for n in shape[:4]))
+    corners = [(*start, *(0 for _ in shape[4:])) for start in corner_starts]
+    evenly_spaced = np.linspace(0, plan.design.points - 1, CHECKED_POINTS).astype(np.int64)
+    numbers = np.unique([*evenly_spaced, *(int(np.ravel_multi_index(c, shape)) for c in corners)])
     for values in plan.design.at(numbers):
         robot, conditions = variation.at(jnp.asarray(values), plan.fixed())
         try:
@@ -114,9 +117,14 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan)
 def store_layout(config: Campaign, job: scale.Job) -> StoreLayout:
     """Arrays in the store of a job, with units and long names."""
     attributes = job.task.attributes
-    variables = {n: (scale.KINDS.get(n, config.storage), _store_attributes(attributes[n])) for n in job.outputs}
-    meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
-    variables[STATUS] = scale.KINDS[STATUS], {"long_name": "status of the run", **meanings}
+    variables = {
+        n: (scale.STORED_TYPES.get(n, config.storage), _store_attributes(attributes[n])) for n in job.outputs
+    }
+    flag_attributes = {
+        "flag_values": [*range(len(STATUSES)), ABSENT],
+        "flag_meanings": " ".join((*STATUSES, "absent")),
+    }
+    variables[STATUS] = scale.STORED_TYPES[STATUS], {"long_name": "status of the run", **flag_attributes}
     coordinates = {
         n: _store_attributes({"units": axis.unit, "long_name": axis.meaning}) for n, axis in job.plan.axes.items()
     }
@@ -128,6 +136,6 @@ def store_layout(config: Campaign, job: scale.Job) -> StoreLayout:
     )
 
 
-def _store_attributes(about: Json) -> Json:
+def _store_attributes(attributes: Json) -> Json:
     """Attributes as in a store, with unit 1 for quantities without unit."""
-    return {**about, "units": "1"} if about.get("units") in ("-", "") else about
+    return {**attributes, "units": "1"} if attributes.get("units") in ("-", "") else attributes

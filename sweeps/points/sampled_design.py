@@ -25,11 +25,11 @@ SAMPLE = "sample"
 ROW = "run"
 
 
-#: Number of points that a distribution computes together. JAX compiles a program for each number, and sums over
-#: coordinates may depend on it.
-TOGETHER = 4096
+#: Number of points in one call of a distribution. JAX compiles a program for each number, and sums over coordinates
+#: may depend on it.
+BLOCK_POINTS = 4096
 #: Number of points that a thread computes at once is a multiple of this.
-PART = 16 * TOGETHER
+THREAD_POINTS = 16 * BLOCK_POINTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,24 +60,28 @@ class Samples:
         """Values of `count` points from number `first` on, one row for each name. Many points are computed on all
         processors.
         """
-        if count <= PART:
+        if count <= THREAD_POINTS:
             return self._values(first, count)
-        starts = range(first - first % PART, first + count, PART)
-        parts = [(max(start, first), min(start + PART, first + count)) for start in starts]
+        starts = range(first - first % THREAD_POINTS, first + count, THREAD_POINTS)
+        ranges = [(max(start, first), min(start + THREAD_POINTS, first + count)) for start in starts]
         with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as threads:
-            return np.concatenate([*threads.map(lambda p: self._values(p[0], p[1] - p[0]), parts)], axis=1)
+            return np.concatenate(
+                [*threads.map(lambda limits: self._values(limits[0], limits[1] - limits[0]), ranges)], axis=1
+            )
 
     def _values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
         from scipy.special import ndtri
 
-        joint = 0 if self.joint is None else len(self.joint)
-        begin = first - first % TOGETHER
-        padded_count = first + count + -(first + count) % TOGETHER - begin
-        unit = DESIGNS[self.design](self.seed, self.number, len(self.marginals) + joint, begin, padded_count)
+        joint_count = 0 if self.joint is None else len(self.joint)
+        block_start = first - first % BLOCK_POINTS
+        padded_count = first + count + -(first + count) % BLOCK_POINTS - block_start
+        unit = DESIGNS[self.design](
+            self.seed, self.number, len(self.marginals) + joint_count, block_start, padded_count
+        )
         rows = [quantile(u) for quantile, u in zip(self.marginals.values(), unit, strict=False)]
         if self.joint is not None:
             rows.extend(in_blocks(self.joint.values, ndtri(unit[len(self.marginals) :]).T).T)
-        return np.array(rows)[:, first - begin : first - begin + count]
+        return np.array(rows)[:, first - block_start : first - block_start + count]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,12 +113,12 @@ def in_blocks(
     """Values of a JAX function at many points, computed on the CPU regardless of the sweep's device."""
     import jax
 
-    points = len(normal_scores)
-    full = np.zeros((points + -points % TOGETHER, *normal_scores.shape[1:]))
-    full[:points] = normal_scores
+    count = len(normal_scores)
+    padded = np.zeros((count + -count % BLOCK_POINTS, *normal_scores.shape[1:]))
+    padded[:count] = normal_scores
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        blocks = [np.asarray(values(full[k : k + TOGETHER])) for k in range(0, len(full), TOGETHER)]
-    return np.concatenate(blocks)[:points]
+        blocks = [np.asarray(values(padded[k : k + BLOCK_POINTS])) for k in range(0, len(padded), BLOCK_POINTS)]
+    return np.concatenate(blocks)[:count]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,8 +160,8 @@ class Design:
         sizes = tuple(b.stop - b.start for b in box)
         values = np.empty((len(self.names), *sizes))
         for k, axis in enumerate(self.axes.values()):
-            along = (slice(None),) + (None,) * (len(sizes) - k - 1)
-            values[k] = axis[box[k]][along]
+            broadcast = (slice(None),) + (None,) * (len(sizes) - k - 1)
+            values[k] = axis[box[k]][broadcast]
         if self.samples is not None:
             samples = self.samples.values(box[-1].start, sizes[-1])
             for k, row in enumerate(samples, len(self.axes)):
@@ -166,9 +170,9 @@ class Design:
 
     def at(self, numbers: Int[np.ndarray, " points"]) -> Float[np.ndarray, "points names"]:
         """Values of a few points by their numbers. The last dimension varies fastest."""
-        places = np.array(np.unravel_index(np.asarray(numbers), self.shape)).T
+        indices = np.array(np.unravel_index(np.asarray(numbers), self.shape)).T
         return np.concatenate(
-            [self.values_in_slices(tuple(slice(i, i + 1) for i in map(int, place))) for place in places]
+            [self.values_in_slices(tuple(slice(i, i + 1) for i in map(int, index))) for index in indices]
         )
 
 
@@ -185,12 +189,13 @@ class Blocks:
     size: tuple[int, ...]
 
     @staticmethod
-    def of(shape: tuple[int, ...], most: int) -> Blocks:
-        """Boxes with at most `most` points and nearly equal sizes."""
-        size, inner = [1] * len(shape), 1
+    def of(shape: tuple[int, ...], max_points: int) -> Blocks:
+        """Boxes with at most `max_points` points and nearly equal sizes."""
+        size = [1] * len(shape)
+        inner = 1
         for k in reversed(range(len(shape))):
-            if inner * shape[k] > most:
-                parts = math.ceil(shape[k] / max(most // inner, 1))
+            if inner * shape[k] > max_points:
+                parts = math.ceil(shape[k] / max(max_points // inner, 1))
                 size[k] = math.ceil(shape[k] / parts)
                 break
             size[k] = shape[k]
@@ -216,8 +221,8 @@ class Blocks:
 
     def box(self, number: int) -> tuple[slice, ...]:
         """Range of a chunk along each axis."""
-        places = zip(self.place(number), self.size, self.shape, strict=True)
-        return tuple(slice(k * s, min((k + 1) * s, n)) for k, s, n in places)
+        per_axis = zip(self.place(number), self.size, self.shape, strict=True)
+        return tuple(slice(k * s, min((k + 1) * s, n)) for k, s, n in per_axis)
 
     def count(self, number: int) -> int:
         """Number of points in a chunk."""
@@ -265,7 +270,7 @@ def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: 
 #: Rounds of the Feistel network. Luby and Rackoff (1988) need four. The others make up for weak round functions.
 ROUNDS = 8
 #: Points that are permuted together, so few that they stay in the processor's cache.
-CACHED = 65_536
+CACHE_POINTS = 65_536
 
 
 def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points"]) -> UInt64[np.ndarray, " points"]:
@@ -280,10 +285,11 @@ def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points
     a = math.isqrt(number - 1) + 1
     b = -(-number // a)
     keys = np.random.Philox(key=key).random_raw(ROUNDS)
-    answer = np.array(points)
-    for first in range(0, len(answer), CACHED):
-        block = answer[first : first + CACHED]
-        unplaced, scratch = np.arange(len(block)), np.empty((2, len(block)), np.uint64)
+    permuted = np.array(points)
+    for first in range(0, len(permuted), CACHE_POINTS):
+        block = permuted[first : first + CACHE_POINTS]
+        unplaced = np.arange(len(block))
+        scratch = np.empty((2, len(block)), np.uint64)
         while len(unplaced):
             high, low = np.divmod(block[unplaced], np.uint64(b))
             x, y = scratch[:, : len(unplaced)]
@@ -294,19 +300,19 @@ def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points
             high += low
             block[unplaced] = high
             unplaced = unplaced[high >= number]
-    return answer
+    return permuted
 
 
 Words = UInt64[np.ndarray, " n"]
 
 
-def _add_modulo(x: Words, word: Words, most: np.uint64, scratch: Words) -> None:
-    """x = x + r modulo `most` (below 2^32). r scales the upper half of a word to 0 .. most - 1."""
+def _add_modulo(x: Words, word: Words, modulus: np.uint64, scratch: Words) -> None:
+    """x = x + r modulo `modulus` (below 2^32). r scales the upper half of a word to 0 .. most - 1."""
     word >>= np.uint64(32)
-    word *= most
+    word *= modulus
     word >>= np.uint64(32)
     x += word
-    np.subtract(x, most, out=scratch)
+    np.subtract(x, modulus, out=scratch)
     np.minimum(x, scratch, out=x)  # a negative difference wraps to a larger number
 
 
@@ -329,7 +335,7 @@ def _mix_words(words: Words, key: np.uint64, x: Words, scratch: Words) -> Words:
 
 #: Bits of a Sobol number. A double has room for them and for the half that keeps it above 0.
 BITS = 52
-_LOW = 12  # low bits of a point's number, tabulated
+_LOW_BITS = 12  # low bits of a point's number, tabulated
 
 
 def sobol(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
@@ -340,11 +346,11 @@ def sobol(seed: int, number: int, dimensions: int, first: int, count: int) -> Un
     """
     directions, shift = _directions(seed, dimensions)
     table = np.zeros((dimensions, 1), np.uint64)  # for k = 0 .. 2^LOW - 1, in the order of Gray codes
-    for bit in range(_LOW):
+    for bit in range(_LOW_BITS):
         table = np.concatenate([table, table[:, ::-1] ^ directions[:, bit : bit + 1]], axis=1)
     unit = np.empty((dimensions, count))
-    size = 1 << _LOW
-    for block in range(first >> _LOW, ((first + count - 1) >> _LOW) + 1):
+    size = 1 << _LOW_BITS
+    for block in range(first >> _LOW_BITS, ((first + count - 1) >> _LOW_BITS) + 1):
         begin, end = max(first, block * size), min(first + count, (block + 1) * size)
         # gray(block * 2^LOW + i) = gray(block * 2^LOW) ^ gray(i)
         gray = block * size ^ (block * size >> 1)

@@ -53,7 +53,7 @@ from sweeps.store import (
 )
 
 #: Packages whose versions are part of a sweep's identity, in addition to those of every result.
-FURTHER = ("scipy", "zarr")
+MORE_PACKAGES = ("scipy", "zarr")
 
 Identity = dict[str, dict[str, str]]
 
@@ -69,26 +69,27 @@ def job_identity(config: BaseModel, robot: Robot, files: Iterable[str], device: 
     Raises:
         BadConfiguration: a file cannot be read.
     """
-    configuration = _flat(config.model_dump(mode="json", exclude={"report", "table"}), "")
+    configuration = _flatten(config.model_dump(mode="json", exclude={"report", "table"}), "")
     configuration |= {f"robot {p.name}": repr(float(p.value)) for p in params.walk_parameters(robot)}
     return {
         "configuration": configuration,
         "data": {file: sha256_hex(file_bytes(Path(file), file, BadConfiguration)) for file in files},
         "code": {"source": source_hash()},
-        "versions": {"python": platform.python_version(), **installed_versions((*PACKAGES, *FURTHER))},
+        "versions": {"python": platform.python_version(), **installed_versions((*PACKAGES, *MORE_PACKAGES))},
         "device": {"device": device},
     }
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
+    """Version of each package."""
     return {name: importlib.metadata.version(name) for name in packages}
 
 
-def _flat(content: Json, prefix: str) -> dict[str, str]:
+def _flatten(content: Json, prefix: str) -> dict[str, str]:
     flat: dict[str, str] = {}
     for key, value in content.items():
         if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
+            flat |= _flatten(value, f"{prefix}{key}.")
         else:
             flat[f"{prefix}{key}"] = repr(value)
     return flat
@@ -110,11 +111,11 @@ def identity_differences(stored: Mapping[str, Mapping[str, str]], now: Mapping[s
 def _change(old: str | None, new: str | None, section: str) -> str:
     if old is None or new is None:
         return " is new" if old is None else " is gone"
-    # hashes and long lists do not help a reader
+    # hashes and long lists are not shown
     return "" if section in ("data", "code") or len(old) + len(new) > 80 else f" was {old}, is {new}"
 
 
-#: Name of the command in the folder of a store. Sweeps into tables leave other files.
+#: Name of the command in the lock file. It differs from that of sweeps into tables, which leave other files.
 COMMAND = "sweep into a store"
 #: Status of a point that has not been simulated.
 ABSENT = 255
@@ -124,7 +125,7 @@ BLOCK, METADATA = 4096, 1024
 
 @dataclasses.dataclass(frozen=True)
 class StoreLayout:
-    """StoreLayout of a store.
+    """Arrays, chunks and attributes of a store.
 
     Attributes:
         design: the points.
@@ -150,22 +151,24 @@ class StoreLayout:
         """Uncompressed size of the store on disk [bytes]: files and folders in blocks, metadata and journal."""
         counts, points = self.blocks.counts, self.blocks.points
         folders = sum(math.prod(counts[:k]) for k in range(len(counts)))
-        point_bytes = sum(_on_disk(np.dtype(v).itemsize * points) for v, _ in self.variables.values()) * len(
+        point_bytes = sum(_disk_size(np.dtype(v).itemsize * points) for v, _ in self.variables.values()) * len(
             self.blocks
         )
         outputs = point_bytes + BLOCK * folders * len(self.variables)
         names = () if self.design.samples is None else self.design.samples.names
-        sample_size = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
-        axes = sum(_on_disk(8 * len(values)) for values in self.design.axes.values())
+        sample_size = len(names) * counts[-1] * _disk_size(8 * self.blocks.size[-1])
+        axes = sum(_disk_size(8 * len(values)) for values in self.design.axes.values())
         arrays = len(self.variables) + len(names) + len(self.design.axes)
         widest = dict.fromkeys(self.variables, (-1.2345678901234567e-300,) * 2)
         checks = dict.fromkeys([*widest, *names], 2**32 - 1)
-        line = _line(Done(len(self.blocks), (points,) * len(STATUSES), widest, checks))
-        return outputs + sample_size + axes + arrays * (3 * BLOCK + METADATA) + _on_disk(len(line) * len(self.blocks))
+        line = _journal_line(ChunkRecord(len(self.blocks), (points,) * len(STATUSES), widest, checks))
+        return (
+            outputs + sample_size + axes + arrays * (3 * BLOCK + METADATA) + _disk_size(len(line) * len(self.blocks))
+        )
 
 
 @dataclasses.dataclass(frozen=True)
-class Done:
+class ChunkRecord:
     """Journal entry of a finished chunk.
 
     Attributes:
@@ -185,7 +188,7 @@ class SweepStore(Folder):
     """Folder of a sweep, named `path` + `.partial` until it is complete, shared by the processes of a job array."""
 
     scratch = ASIDE
-    further = ("runs.csv", "runs.parquet")
+    extra_names = ("runs.csv", "runs.parquet")
 
     def __init__(self, path: Path, identity: Identity, layout: StoreLayout, *, force: bool = False) -> None:
         """Creates a store, or continues one with the same identity.
@@ -201,12 +204,12 @@ class SweepStore(Folder):
         self._journal: TextIO | None = None
         self._share: Path | None = None
         self._identity = identity
-        self._aside = self.partial / ASIDE / "identity"
-        self._sound: dict[int, Done] = {}
+        self._temporary = self.partial / ASIDE / "identity"
+        self._intact: dict[int, ChunkRecord] = {}
         self._damaged = set[int]()
-        cut_short = (path / LOCK).is_file()  # the process was killed while it moved the folder into place
-        if self._is_finished() and (not force or (cut_short and not self._differs(path))):
-            self._take_finished()
+        was_killed = (path / LOCK).is_file()  # the process was killed while it moved the folder into place
+        if self._is_finished() and (not force or (was_killed and not self._differences(path))):
+            self._use_finished()
             return
         self.refuse_taken(force)
         self.refuse_foreign(COMMAND, force)
@@ -232,53 +235,53 @@ class SweepStore(Folder):
         with self._locked():
             if not self._present():
                 return self._finished_by_another(force)
-            self._begin_or_take_up(force)
+            self._create_or_continue(force)
         return True
 
     def _is_finished(self) -> bool:
         return listed_names(self.path) is not None and (self.path / IDENTITY).is_file()
 
     def _finished_by_another(self, force: bool = False) -> bool:
-        if not self._is_finished() or (force and self._differs(self.path)):
+        if not self._is_finished() or (force and self._differences(self.path)):
             return False
-        self._take_finished()
+        self._use_finished()
         return True
 
-    def _take_finished(self) -> None:
-        self._same(self.path)
+    def _use_finished(self) -> None:
+        self._check_identity(self.path)
         self._tidy()
         self.finished = True
         self._refuse_damaged()
 
-    def _begin_or_take_up(self, force: bool) -> None:
-        if (self.partial / IDENTITY).is_file() and not (force and self._differs(self.partial)):
-            self._same(self.partial)
+    def _create_or_continue(self, force: bool) -> None:
+        if (self.partial / IDENTITY).is_file() and not (force and self._differences(self.partial)):
+            self._check_identity(self.partial)
             self._mend_layout()
         elif not force and self._is_finished():  # finished by another process in the meantime
-            self._take_finished()
+            self._use_finished()
             self._remove_partial()
         else:
             self._create()
 
     # --- identity ---------------------------------------------------------------------------------
 
-    def _differs(self, folder: Path) -> str:
+    def _differences(self, folder: Path) -> str:
         try:
             stored = json.loads((folder / IDENTITY).read_text(encoding="utf-8"))
             return identity_differences(stored, self._identity)
         except (ValueError, AttributeError, TypeError, RecursionError):
             return IDENTITY
 
-    def _same(self, folder: Path) -> None:
-        differ = self._differs(folder)
-        if differ == IDENTITY:
+    def _check_identity(self, folder: Path) -> None:
+        differences = self._differences(folder)
+        if differences == IDENTITY:
             raise BadData(
                 f"--out: {folder / 'identity.json'} is damaged; choose another path, or --force to start again"
             )
-        if differ:
+        if differences:
             raise BadConfiguration(
-                f"--out: {folder} contains another sweep, which differs in {differ}; choose another path, or use "
-                "--force to start again"
+                f"--out: {folder} contains another sweep, which differs in {differences}; choose another path, or "
+                "use --force to start again"
             )
 
     @contextlib.contextmanager
@@ -298,18 +301,18 @@ class SweepStore(Folder):
         Raises:
             BadConfiguration: another process is writing to the store that would be replaced.
         """
-        share = share_at_work(self.partial, self._share)
-        if share is not None:
-            raise self._busy(share)
+        busy_share = share_at_work(self.partial, self._share)
+        if busy_share is not None:
+            raise self._busy(busy_share)
         self._clear()
         (self.partial / LOCK).write_text(lock_text(COMMAND), encoding="utf-8")
         (self.partial / JOURNAL).mkdir()
         (self.partial / ASIDE).mkdir()
         with naming_file(self.partial / STORE):
             create_store(self.partial / STORE, self.layout)
-        write_file(self.partial / IDENTITY, json.dumps(self._identity, indent=1).encode(), self._aside)
+        write_file(self.partial / IDENTITY, json.dumps(self._identity, indent=1).encode(), self._temporary)
 
-    def _altered(self, folder: Path) -> dict[Path, bytes]:
+    def _altered_files(self, folder: Path) -> dict[Path, bytes]:
         """Files of metadata and axes that differ from those of `create_store`, with their correct content."""
         with tempfile.TemporaryDirectory() as scratch_folder:
             create_store(Path(scratch_folder) / STORE, self.layout)
@@ -321,10 +324,10 @@ class SweepStore(Folder):
 
     def _mend_layout(self) -> None:
         """Rewrites damaged metadata and axes, with a note."""
-        for file, content in self._altered(self.partial).items():
+        for file, content in self._altered_files(self.partial).items():
             print_message(f"{file}: damaged, so it is written again")
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_file(file, content, self._aside)
+            write_file(file, content, self._temporary)
 
     def _refuse_damaged(self) -> None:
         """Rejects a finished sweep with a damaged file.
@@ -332,11 +335,11 @@ class SweepStore(Folder):
         Raises:
             BadData: a file is damaged.
         """
-        damaged = next(iter(self._altered(self.path)), None)
+        damaged = next(iter(self._altered_files(self.path)), None)
         if damaged is None and len(self.done()) < len(self.layout.blocks):
-            damaged_chunk = min(set(range(len(self.layout.blocks))) - set(self._sound))
+            damaged_chunk = min(set(range(len(self.layout.blocks))) - set(self._intact))
             records = self._records().get(damaged_chunk, [])
-            damaged = self._wrong_file(records[-1]) if records else self.path / JOURNAL
+            damaged = self._damaged_file(records[-1]) if records else self.path / JOURNAL
         if damaged is not None:
             raise BadData(f"--out: {damaged} is damaged; choose another path, or --force to start again")
 
@@ -349,7 +352,8 @@ class SweepStore(Folder):
             BadConfiguration: another process holds the lock, or has removed or replaced the store.
         """
         name = f"{shard[0]}-of-{shard[1]}"
-        file, self._aside = self.partial / JOURNAL / f"{name}.jsonl", self.partial / ASIDE / f"{name}-{os.getpid()}"
+        file = self.partial / JOURNAL / f"{name}.jsonl"
+        self._temporary = self.partial / ASIDE / f"{name}-{os.getpid()}"
         with self._locked():
             if not self._present():
                 if self._finished_by_another():
@@ -357,41 +361,41 @@ class SweepStore(Folder):
                 raise BadConfiguration(
                     f"--out: another process has removed {self.partial}; the same command starts again"
                 )
-            self._same(self.partial)
+            self._check_identity(self.partial)
             journal = file.open("a+", encoding="utf-8")
             if not try_to_lock(journal):
                 journal.close()
                 raise self._busy(name)
             self._journal, self._share = journal, file
-        if file.stat().st_size:  # a line that a kill cut short must not absorb the next
+        if file.stat().st_size:  # the last line may be incomplete, if the process was killed
             self._journal.write("\n")
             self._journal.flush()
 
-    def done(self) -> dict[int, Done]:
+    def done(self) -> dict[int, ChunkRecord]:
         """Finished chunks with undamaged files, by number. Each damaged chunk is reported once."""
         for chunk, records in self._records().items():
-            if chunk in self._sound:
+            if chunk in self._intact:
                 continue
-            undamaged = next((record for record in records if self._wrong_file(record) is None), None)
+            undamaged = next((record for record in records if self._damaged_file(record) is None), None)
             if undamaged is not None:
-                self._sound[chunk] = undamaged
+                self._intact[chunk] = undamaged
             elif chunk not in self._damaged and not self.finished:
                 self._damaged.add(chunk)
-                print_message(f"{self._wrong_file(records[-1])}: damaged, so it is computed again")
-        return dict(sorted(self._sound.items()))
+                print_message(f"{self._damaged_file(records[-1])}: damaged, so it is computed again")
+        return dict(sorted(self._intact.items()))
 
-    def _records(self) -> dict[int, list[Done]]:
+    def _records(self) -> dict[int, list[ChunkRecord]]:
         """Complete lines of all journals, by chunk."""
-        records: dict[int, list[Done]] = {}
+        records: dict[int, list[ChunkRecord]] = {}
         folder = self.path if self.finished else self.partial
         for file in sorted((folder / JOURNAL).glob("*.jsonl")):
             for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
-                record = _record(line)
+                record = _parse_line(line)
                 if record is not None and 0 <= record.chunk < len(self.layout.blocks):
                     records.setdefault(record.chunk, []).append(record)
         return records
 
-    def _wrong_file(self, record: Done) -> Path | None:
+    def _damaged_file(self, record: ChunkRecord) -> Path | None:
         """Damaged file of a chunk, or None."""
         store = (self.path if self.finished else self.partial) / STORE
         for name, file in self._files(record.chunk).items():
@@ -404,48 +408,54 @@ class SweepStore(Folder):
 
     def _files(self, chunk: int) -> dict[str, Path]:
         """Files of a chunk, by array. Those of samples belong to chunks at the beginning of all other axes."""
-        place, samples = self.layout.blocks.place(chunk), self.layout.design.samples
+        place = self.layout.blocks.place(chunk)
+        samples = self.layout.design.samples
         files = {v: Path(v, "c", *map(str, place)) for v in self.layout.variables}
         if samples is not None and not any(place[:-1]):
             files |= {name: Path(name, "c", *map(str, place[-1:])) for name in samples.names}
         return files
 
-    def write(self, chunk: int, arrays: Columns, drawn: np.ndarray | None) -> Done:
+    def write(self, chunk: int, arrays: Columns, sample_values: np.ndarray | None) -> ChunkRecord:
         """Writes a chunk and marks it as done.
 
         Args:
             arrays: values by variable, one for each point of its box.
-            drawn: values of the samples, one row for each name. Only chunks at the beginning of all axes write them.
+            sample_values: values of the samples, one row for each name. Only chunks at the beginning of all axes
+                write them.
         """
-        layout, files = self.layout, self._files(chunk)
+        layout = self.layout
+        files = self._files(chunk)
         box = layout.blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)
-        checks, ranges = dict[str, int](), dict[str, tuple[float, float]]()
+        checks = dict[str, int]()
+        ranges = dict[str, tuple[float, float]]()
         for name, (dtype, _) in layout.variables.items():
             values = np.asarray(arrays[name], dtype)
-            checks[name] = self._chunk(files[name], values.reshape(shape), layout.blocks.size, fill_value(dtype))
+            checks[name] = self._write_array_chunk(
+                files[name], values.reshape(shape), layout.blocks.size, fill_value(dtype)
+            )
             extremes = float(np.fmin.reduce(values)), float(np.fmax.reduce(values))  # without NaN
             if values.dtype.kind == "f" and np.isfinite(extremes).all():
                 ranges[name] = extremes
         samples = layout.design.samples
-        if samples is not None and drawn is not None:
-            for name, values in zip(samples.names, drawn, strict=True):
-                checks[name] = self._chunk(files[name], values, layout.blocks.size[-1:], math.nan)
+        if samples is not None and sample_values is not None:
+            for name, values in zip(samples.names, sample_values, strict=True):
+                checks[name] = self._write_array_chunk(files[name], values, layout.blocks.size[-1:], math.nan)
         counts = np.bincount(np.asarray(arrays[STATUS], np.intp), minlength=len(STATUSES))
-        record = Done(chunk, tuple(counts.tolist()), ranges, checks)
+        record = ChunkRecord(chunk, tuple(counts.tolist()), ranges, checks)
         assert self._journal is not None
-        self._journal.write(_line(record))
+        self._journal.write(_journal_line(record))
         self._journal.flush()
         os.fsync(self._journal.fileno())
-        self._sound[chunk] = record
+        self._intact[chunk] = record
         return record
 
-    def _chunk(self, file: Path, values: np.ndarray, size: tuple[int, ...], empty: Any) -> int:
+    def _write_array_chunk(self, file: Path, values: np.ndarray, size: tuple[int, ...], fill: Any) -> int:
         """Writes the chunk of an array and returns its checksum."""
         if values.shape != size:  # the format requires padding of the last chunk of an axis
-            full = np.full(size, empty, values.dtype)
-            full[tuple(slice(n) for n in values.shape)] = values
-            values = full
+            padded = np.full(size, fill, values.dtype)
+            padded[tuple(slice(n) for n in values.shape)] = values
+            values = padded
         path = self.partial / STORE / file
         path.parent.mkdir(parents=True, exist_ok=True)
         content = values.tobytes()
@@ -453,21 +463,21 @@ class SweepStore(Folder):
             from numcodecs.zstd import Zstd
 
             content = bytes(Zstd(**ZSTD).encode(content))
-        write_file(path, content, self._aside)
+        write_file(path, content, self._temporary)
         return zlib.crc32(content)
 
     # --- the end ----------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def last(self) -> Iterator[bool]:
+    def finishing(self) -> Iterator[bool]:
         """Yields True if this process finishes the sweep: every chunk is done and no process has finished it."""
         with self._locked():
-            if not self._present():
+            if not self._present():  # another process has moved it into place
                 self.finished = True
             yield not self.finished and len(self.done()) == len(self.layout.blocks)
 
     def move_into_place(self) -> Path:
-        """As of every folder. Call within `last`."""
+        """Moves the folder as `Folder.move_into_place` does. Call it within `finishing`."""
         path = super().move_into_place()
         self.finished = True
         return path
@@ -489,21 +499,21 @@ class SweepStore(Folder):
                 self._remove_partial()
 
 
-def write_file(path: Path, content: Any, aside: Path) -> None:
+def write_file(path: Path, content: Any, temporary: Path) -> None:
     """Writes a file atomically, so that it also survives a power failure.
 
     Args:
-        aside: temporary path on the same disk, which is renamed at the end.
+        temporary: temporary path on the same disk, which is renamed at the end.
     """
     try:
-        with aside.open("wb") as stream:
+        with temporary.open("wb") as stream:
             stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(aside, path)
+        os.replace(temporary, path)
     except OSError as error:
         with contextlib.suppress(OSError):
-            aside.unlink()
+            temporary.unlink()
         error.filename = str(path)
         raise
 
@@ -520,11 +530,12 @@ def create_store(path: Path, layout: StoreLayout) -> None:
     group = zarr.create_group(path, zarr_format=3, attributes=dict(layout.attributes))
     design, blocks = layout.design, layout.blocks
     sampled_names = design.samples.names if design.samples is not None else ()
-    further = {"coordinates": " ".join(sampled_names)} if sampled_names else {}
+    coordinate_attribute = {"coordinates": " ".join(sampled_names)} if sampled_names else {}
     for name, (dtype, attributes) in layout.variables.items():
         group.create_array(
             name, shape=design.shape, chunks=blocks.size, dtype=dtype, fill_value=fill_value(dtype),
-            compressors=compressors, dimension_names=design.dimensions, attributes={**attributes, **further},
+            compressors=compressors, dimension_names=design.dimensions,
+            attributes={**attributes, **coordinate_attribute},
         )  # fmt: skip
     for name, values in design.axes.items():
         words = layout.labels.get(name)
@@ -544,19 +555,22 @@ def create_store(path: Path, layout: StoreLayout) -> None:
         zarr.consolidate_metadata(path)
 
 
-#: Most points of a sample of a store, and most chunks to take them from.
-THINNED, SAMPLED_CHUNKS = 200_000, 100
+#: Maximum number of sampled points of a store, and of chunks that they are read from.
+SAMPLED_POINTS, SAMPLED_CHUNKS = 200_000, 100
 
 
 def sample_store(store: Path, layout: StoreLayout) -> tuple[Columns, Columns]:
-    """Varied values and outputs by name, at a random selection of the points, always the same."""
+    """Varied values and outputs by name, at a random selection of the points. The seed is fixed."""
     import zarr
 
     group: Any = zarr.open_group(store, mode="r")
-    rng, blocks, design = np.random.default_rng(0), layout.blocks, layout.design
+    rng = np.random.default_rng(0)
+    blocks = layout.blocks
+    design = layout.design
     chunks = np.sort(rng.permutation(len(blocks))[:SAMPLED_CHUNKS])
-    points_per_chunk = -(-THINNED // len(chunks))
-    values, outputs = list[np.ndarray](), {name: list[np.ndarray]() for name in layout.variables}
+    points_per_chunk = -(-SAMPLED_POINTS // len(chunks))
+    values = list[np.ndarray]()
+    outputs = {name: list[np.ndarray]() for name in layout.variables}
     for chunk in map(int, chunks):
         box, count = blocks.box(chunk), blocks.count(chunk)
         rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
@@ -567,7 +581,7 @@ def sample_store(store: Path, layout: StoreLayout) -> tuple[Columns, Columns]:
     return varied, {name: np.concatenate(parts) for name, parts in outputs.items()}
 
 
-def _on_disk(size: int) -> int:
+def _disk_size(size: int) -> int:
     return -(-size // BLOCK) * BLOCK
 
 
@@ -576,18 +590,18 @@ def fill_value(dtype: str) -> Any:
     return math.nan if np.dtype(dtype).kind == "f" else ABSENT
 
 
-def _line(record: Done) -> str:
+def _journal_line(record: ChunkRecord) -> str:
     body = json.dumps(dataclasses.astuple(record), separators=(",", ":"))
     return f"{zlib.crc32(body.encode()):08x} {body}\n"
 
 
-def _record(line: str) -> Done | None:
+def _parse_line(line: str) -> ChunkRecord | None:
     """Entry of a journal line, None if the line is incomplete."""
     check, _, body = line.partition(" ")
     if not body or f"{zlib.crc32(body.encode()):08x}" != check:
         return None
     try:
         chunk, statuses, ranges, checks = json.loads(body)
-        return Done(int(chunk), tuple(statuses), {name: tuple(r) for name, r in ranges.items()}, dict(checks))
+        return ChunkRecord(int(chunk), tuple(statuses), {name: tuple(r) for name, r in ranges.items()}, dict(checks))
     except (ValueError, TypeError, AttributeError, RecursionError):
         return None

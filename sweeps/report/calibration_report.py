@@ -23,119 +23,128 @@ LINES = {"after_": "calibrated", "before_": "before"}
 
 
 def calibration_document(
-    found: CalibrationResult, robot_name: str, voltage_fit: Feedforward | None = None
+    result: CalibrationResult, robot_name: str, voltage_fit: Feedforward | None = None
 ) -> Document:
     """Report of a calibration. `robot_name` is the name or the file of the robot."""
-    sized = Layout.of(found.robot).crosses_zero
+    in_units = Layout.of(result.robot).crosses_zero
     search = Note(
-        as_paragraph([found.starts.statement()]), "" if found.converged else "warn", "search", terminal=True
+        as_paragraph([result.starts.statement()]), "" if result.converged else "warn", "search", terminal=True
     )
-    rms = [fit_tables.rms_table(found.rms, found.channels)] if sized else []
-    answer = fit_words.calibration_answer(found)
-    table = found.rows()
+    rms = [fit_tables.rms_table(result.rms, result.channels)] if in_units else []
+    answer = fit_words.calibration_answer(result)
+    rows = result.rows()
     kinds = {"": "measured", "after_": "fitted"}
     return Document(
-        f"Calibration of {words.displayed_robot_name(Path(robot_name).name)} to {Path(found.source).name}",
+        f"Calibration of {words.displayed_robot_name(Path(robot_name).name)} to {Path(result.source).name}",
         answer,
         (
-            Note(f"{found.adequacy.statement}.", "lead", "adequate", terminal=True),
-            *([catalogue.figure("fit.overlay", table, found.channels, LINES, finding=answer)] if found.axis else []),
-            _parameters(found),
-            _errors(found),
+            Note(f"{result.adequacy.statement}.", "lead", "adequate", terminal=True),
+            *([catalogue.figure("fit.overlay", rows, result.channels, LINES, finding=answer)] if result.axis else []),
+            _parameters(result),
+            _errors(result),
             *rms,
             search,
-            *run_tables.curve_warning(found.robot),
-            *remarks(found.notes),
+            *run_tables.curve_warning(result.robot),
+            *remarks(result.notes),
             catalogue.note("calibration.free"),
         ),
         (
-            *_over_rows(found),
+            *_over_rows(result),
             *([voltage_section(voltage_fit)] if voltage_fit is not None else []),
-            *fit_tables.clusters_section(found.residual_clusters),
-            Section("Noise", tuple(_noise(found))),
-            fit_tables.rows_section(table, found.channels, kinds, sized),
+            *fit_tables.clusters_section(result.residual_clusters),
+            Section("Noise", tuple(_noise(result))),
+            fit_tables.rows_section(rows, result.channels, kinds, in_units),
         ),
-        brief=fit_words.brief_calibration(found),
+        brief=fit_words.brief_calibration(result),
     )
 
 
-def _parameters(found: CalibrationResult) -> Table:
+def _parameters(result: CalibrationResult) -> Table:
     rows = []
-    for name, p in found.parameters.items():
-        ends = zip(("≤ ", "≥ "), p.interval_open, p.interval, strict=True)
-        interval = " to ".join(f"{sign * beyond}{value:.3g}" for sign, beyond, value in ends)
-        bound = f", {p.at_bound} bound" if p.at_bound else ""
-        shift, median = fit_tables.shift_cell(p.shift), p.prior.median
-        numbers = (p.value, p.sd, interval, p.unit, median, shift, p.variance_ratio)
-        rows.append((f"`{name}`", *numbers, found.determined(name) + bound, p.meaning))
-    title = f"{count_noun(len(found), 'row')}, {found.model}"
+    for name, parameter in result.parameters.items():
+        limits = zip(("≤ ", "≥ "), parameter.interval_open, parameter.interval, strict=True)
+        interval = " to ".join(f"{prefix * is_open}{value:.3g}" for prefix, is_open, value in limits)
+        bound = f", {parameter.at_bound} bound" if parameter.at_bound else ""
+        shift = fit_tables.shift_cell(parameter.shift)
+        median = parameter.prior.median
+        numbers = (parameter.value, parameter.sd, interval, parameter.unit, median, shift, parameter.variance_ratio)
+        rows.append((f"`{name}`", *numbers, result.determined(name) + bound, parameter.meaning))
+    title = f"{count_noun(len(result), 'row')}, {result.model}"
     return catalogue.table("calibration.parametertable", rows, title=title)
 
 
-def _errors(found: CalibrationResult) -> Table:
+def _errors(result: CalibrationResult) -> Table:
     """rms errors before and after, and of held-out rows, each with its number of rows."""
-    lines = {"before": found.errors_before, "after": found.errors_after}
-    lines |= {f"after, held out by {blocks.kind_in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
+    errors_by_fit = {"before": result.errors_before, "after": result.errors_after}
+    errors_by_fit |= {
+        f"after, held out by {blocks.kind_in_words(k)}": result.held_out[k].errors for k in result.held_out_alike
+    }
     rows = [
         (
-            fit, f"{max(e.rows for e in by.values())}/{len(found)}",
-            *(e.rms_percent if e.rows else None for e in by.values()),
+            fit, f"{max(e.rows for e in errors_by_channel.values())}/{len(result)}",
+            *(e.rms_percent if e.rows else None for e in errors_by_channel.values()),
         )
-        for fit, by in lines.items()
+        for fit, errors_by_channel in errors_by_fit.items()
     ]  # fmt: skip
     title = f"rms of simulated - measured [% of {OF_SIZE}]"
-    return catalogue.table("calibration.errors", rows, *(f"{c.label} | .1f" for c in found.channels), title=title)
+    return catalogue.table("calibration.errors", rows, *(f"{c.label} | .1f" for c in result.channels), title=title)
 
 
-def _noise(found: CalibrationResult) -> Iterable[Block]:
-    if found.tied:
-        ties = (f"`{name}` = {ratio:.4g} x `{leader}`" for name, (leader, ratio) in found.tied.items())
+def _noise(result: CalibrationResult) -> Iterable[Block]:
+    if result.tied:
+        ties = (f"`{name}` = {ratio:.4g} x `{leader}`" for name, (leader, ratio) in result.tied.items())
         yield Note(f"Tied: {'; '.join(ties)}.")
-    noises = {name: (n.median_percent, n.source) for name, n in found.noise.items()}
-    yield Note(fit_tables.noise_sentence(noises, found.channels))
+    noises = {name: (noise.median_percent, noise.source) for name, noise in result.noise.items()}
+    yield Note(fit_tables.noise_sentence(noises, result.channels))
 
 
-def _over_rows(found: CalibrationResult) -> Iterable[Section]:
+def _over_rows(result: CalibrationResult) -> Iterable[Section]:
     """Sections: frequency response of a log, residuals over each condition."""
-    table, panels = found.rows(), found.channels
-    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in panels}
-    if found.axis:
-        runs = Runs(found.source, table, layout=Layout.of(found.robot))
-        for figure in fit_tables.frequency_response(runs, panels, LINES):
+    table = result.rows()
+    channels = result.channels
+    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in channels}
+    if result.axis:
+        runs = Runs(result.source, table, layout=Layout.of(result.robot))
+        for figure in fit_tables.frequency_response(runs, channels, LINES):
             yield Section("Frequency response", (figure,))
-    residuals = catalogue.figure("calibration.residuals", table, panels)
+    residuals = catalogue.figure("calibration.residuals", table, channels)
     yield Section("Residuals against every condition", (residuals,))
 
 
-def feedforward_document(found: Feedforward) -> Document:
+def feedforward_document(fit: Feedforward) -> Document:
     """Constants, gains, remarks and the two figures."""
-    units, t = constant_units(found.unit), found.tolerances
-    gains = [(*name.split("_"), x, units[name.split("_")[1]]) for name, x in found.gains.items()]
-    option_rows = (
-        f"Gains for tolerances of {t.position:g} {found.unit}, {t.velocity:g} {found.unit}/s and {t.effort:g} V, a "
-        f"period of {1000 * t.period:g} ms and a measurement delay of {1000 * (t.delay or 0):.3g} ms."
+    units = constant_units(fit.unit)
+    tolerances = fit.tolerances
+    gains = [(*name.split("_"), x, units[name.split("_")[1]]) for name, x in fit.gains.items()]
+    settings_sentence = (
+        f"Gains for tolerances of {tolerances.position:g} {fit.unit}, {tolerances.velocity:g} {fit.unit}/s and "
+        f"{tolerances.effort:g} V, a period of {1000 * tolerances.period:g} ms and a measurement delay of "
+        f"{1000 * (tolerances.delay or 0):.3g} ms."
     )
-    blocks: list[Block] = [_constants(found), *remarks(sentences(found.remarks))]
+    blocks: list[Block] = [_constants(fit), *remarks(sentences(fit.remarks))]
     if gains:
-        blocks += [catalogue.table("feedforward.gains", gains), *remarks((option_rows,), "asked")]
+        blocks += [catalogue.table("feedforward.gains", gains), *remarks((settings_sentence,), "asked")]
     return Document(
-        f"Feedforward of {'an' if found.mechanism[0] in 'ae' else 'a'} {found.mechanism} mechanism",
-        fit_words.feedforward_statement(found),
+        f"Feedforward of {'an' if fit.mechanism[0] in 'ae' else 'a'} {fit.mechanism} mechanism",
+        fit_words.feedforward_statement(fit),
         tuple(blocks),
-        (Section("Windows", _figures(found)),),
+        (Section("Windows", _figures(fit)),),
     )
 
 
-def voltage_section(found: Feedforward) -> Section:
+def voltage_section(fit: Feedforward) -> Section:
     """The two voltage plots of a log and the constants of their lines, for other reports."""
-    return Section("Voltage against speed and acceleration", (*_figures(found), _constants(found)))
+    return Section("Voltage against speed and acceleration", (*_figures(fit), _constants(fit)))
 
 
-def _figures(found: Feedforward) -> tuple[Figure, ...]:
-    return tuple(catalogue.figure(f"feedforward.{name}", found) for name in ("quasistatic", "dynamic"))
+def _figures(fit: Feedforward) -> tuple[Figure, ...]:
+    return tuple(catalogue.figure(f"feedforward.{name}", fit) for name in ("quasistatic", "dynamic"))
 
 
-def _constants(found: Feedforward) -> Table:
-    units = constant_units(found.unit)
-    rows = [(n, x, interval_95(x, found.sds[n])[1] - x, units[n]) for n, x in found.constants.items()]
+def _constants(fit: Feedforward) -> Table:
+    units = constant_units(fit.unit)
+    rows = [
+        (name, value, interval_95(value, fit.sds[name])[1] - value, units[name])
+        for name, value in fit.constants.items()
+    ]
     return catalogue.table("feedforward.constants", rows)

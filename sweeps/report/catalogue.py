@@ -15,14 +15,14 @@ from sweeps.report.document import Column, Figure, Note, Table, columns
 
 @functools.cache
 def _content() -> Json:
-    words = (resources.files("sweeps.pages") / "templates" / "catalogue.toml").read_text("utf-8")
-    return toml_content(words, "catalogue.toml")
+    source = (resources.files("sweeps.pages") / "templates" / "catalogue.toml").read_text("utf-8")
+    return toml_content(source, "catalogue.toml")
 
 
 def _entry(name: str) -> Json:
     """Texts of a figure, table or note, by its name `report.name` in the catalogue."""
-    room, _, key = name.partition(".")
-    entry: Json = _content()[room][key]
+    report, _, key = name.partition(".")
+    entry: Json = _content()[report][key]
     return entry
 
 
@@ -34,7 +34,7 @@ def text(name: str, *words: Any) -> str:
 
 def figure(
     name: str,
-    *drawn: Any,
+    *arguments: Any,
     finding: str = "",
     words: Sequence[Any] = (),
     more: str = "",
@@ -46,7 +46,7 @@ def figure(
 
     Args:
         name: name in the catalogue, `report.name`.
-        drawn: arguments of the function that draws it.
+        arguments: arguments of the function that draws it.
         finding: finding in words if it depends on the result.
         words: values to fill into the caption.
         more: text to append to the caption.
@@ -58,7 +58,7 @@ def figure(
     module = f"sweeps.{module}" if "." in module else f"sweeps.pages.{module}"
 
     def draw() -> Any:
-        return getattr(importlib.import_module(module), function)(*drawn, *values())
+        return getattr(importlib.import_module(module), function)(*arguments, *values())
 
     return Figure(
         name.partition(".")[2] + f"_{suffix}" * bool(suffix),
@@ -68,18 +68,20 @@ def figure(
     )
 
 
-def table(name: str, rows: Sequence[Sequence[Any]], *more: Column | str, **fields: Any) -> Table:
+def table(name: str, rows: Sequence[Sequence[Any]], *inserted: Column | str, **fields: Any) -> Table:
     """Table of the catalogue.
 
     Args:
         name: name in the catalogue, `report.name`.
-        more: columns, or their titles, that replace "..." in the catalogue.
+        inserted: columns, or their titles, that replace "..." in the catalogue.
     """
     entry = _entry(name)
     heads: list[Column] = []
     for title in entry["columns"]:
-        between = (c if isinstance(c, Column) else columns(c)[0] for c in more) if title == "..." else columns(title)
-        heads += between
+        columns_here = (
+            (c if isinstance(c, Column) else columns(c)[0] for c in inserted) if title == "..." else columns(title)
+        )
+        heads += columns_here
     fixed = {key: entry[key] for key in ("title", "file", "wide", "terminal", "sideways") if key in entry}
     return Table(name.partition(".")[2], tuple(heads), rows, **(fixed | fields))
 

@@ -1,4 +1,4 @@
-"""Reports of requirements: how a robot meets them, and the search for one that does."""
+"""Reports of `check` and `size`: margins of a robot's requirements, and designs that meet requirements."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class CheckResult:
     """Requirements and their outcomes for one robot.
 
     Attributes:
-        asked: the requirements.
+        requirements: the requirements.
         robot: the robot.
         outcomes: one for each requirement, in order.
     """
 
-    asked: Requirements
+    requirements: Requirements
     robot: Robot
     outcomes: tuple[RequirementOutcome, ...]
 
@@ -47,7 +47,8 @@ class CheckResult:
 
     def statement(self) -> str:
         """The answer: number of requirements that are met, and those missed by the largest share of their limits."""
-        number, missed = len(self.outcomes), self.missed
+        number = len(self.outcomes)
+        missed = self.missed
         if not missed:
             return f"All {number} requirements are met." if number > 1 else "The requirement is met."
         missed.sort(key=lambda o: -math.inf if o.margin is None else o.margin / max(abs(requirement_limit(o)), 1e-12))
@@ -60,16 +61,16 @@ class CheckResult:
             )
             for o in missed[:NAMED]
         ]
-        more = len(missed) - len(parts)
+        others = len(missed) - len(parts)
         count = f"{len(missed)} of {number} requirements {'is' if len(missed) == 1 else 'are'} missed"
-        return f"{count}{'. Worst' * (more > 0)}: {'; '.join(parts)}{f'; and {more} more' if more > 0 else ''}."
+        return f"{count}{'. Worst' * (others > 0)}: {'; '.join(parts)}{f'; and {others} more' if others > 0 else ''}."
 
     def to_json(self) -> Json:
         """`result.json`."""
         return {
             "schema": "mmrjax.check/1",
             "statement": self.statement(),
-            "source": self.asked.source,
+            "source": self.requirements.source,
             **sheet.count_outcomes(self.outcomes),
             "requirements": self.outcomes,
         }
@@ -77,10 +78,13 @@ class CheckResult:
 
 def requirement_label(outcome: RequirementOutcome) -> str:
     """Name of a requirement, including its duty."""
-    point, label = outcome.at, outcome.requirement.quantity.label
-    if "duty" not in point:
+    corner = outcome.at
+    label = outcome.requirement.quantity.label
+    if "duty" not in corner:
         return label
-    return f"{label} {point['duty']}" + (f" {100 * point['share']:g} % of the time" if point["share"] else " still")
+    return f"{label} {corner['duty']}" + (
+        f" {100 * corner['share']:g} % of the time" if corner["share"] else " still"
+    )
 
 
 def requirement_limit(outcome: RequirementOutcome) -> float:
@@ -105,7 +109,7 @@ def reached_value_text(outcome: RequirementOutcome) -> str:
     return words.NO_TURN if no_turn else words.OUTCOMES.get(outcome.status) or words.status_meaning(outcome.status)
 
 
-_PLACES = {
+_CORNER_FORMS = {
     "payload_kg": "{} kg", "slope_deg": "{}°", "state_of_charge": "{} % charged", "supply_voltage_V": "{} V",
     "ambient_C": "{} °C",
 }  # fmt: skip
@@ -114,7 +118,7 @@ _PLACES = {
 def worst_corner_text(outcome: RequirementOutcome) -> str:
     """The worst corner in words."""
     parts = []
-    for key, form in _PLACES.items():
+    for key, form in _CORNER_FORMS.items():
         if key in outcome.at:
             values = np.atleast_1d(outcome.at[key]) * (100 if key == "state_of_charge" else 1)
             parts.append(form.format(" to ".join(f"{v:g}" for v in values[::-1])))
@@ -122,18 +126,18 @@ def worst_corner_text(outcome: RequirementOutcome) -> str:
 
 
 #: Number of changes for each missed requirement on the terminal.
-SHOWN = 3
+CHANGES_SHOWN = 3
 
 
-def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
+def check_document(result: CheckResult, robot_name: str, changes: bool = True) -> Document:
     """The report. `changes`: True if changes were searched for."""
-    lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
+    lead = f"Robot: **{robot_name}**. Requirements: **{result.requirements.source}**."
     sections = []
-    if changes and found.missed:
-        sections.append(Section("Changes that would meet them", _blocks_of_changes(found), "changes"))
-    sections.append(Section("Motor and gear", (_chart(found.robot, found.outcomes),)))
-    blocks = Note(lead, "lead"), requirements_sheet(found.outcomes), catalogue.note("check.corners")
-    return Document("Requirements", found.statement(), blocks, tuple(sections))
+    if changes and result.missed:
+        sections.append(Section("Changes that would meet them", _blocks_of_changes(result), "changes"))
+    sections.append(Section("Motor and gear", (_chart(result.robot, result.outcomes),)))
+    blocks = Note(lead, "lead"), requirements_sheet(result.outcomes), catalogue.note("check.corners")
+    return Document("Requirements", result.statement(), blocks, tuple(sections))
 
 
 def _chart(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> Figure:
@@ -157,24 +161,26 @@ def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = 
     return catalogue.table("check.requirements", rows, terminal=terminal)
 
 
-def _blocks_of_changes(found: CheckResult) -> tuple[Note | Table, ...]:
+def _blocks_of_changes(result: CheckResult) -> tuple[Note | Table, ...]:
     """Table of the single changes that would meet a missed requirement."""
-    rows, brief, hopeless = list[tuple[object, ...]](), list[int](), list[str]()
-    for o in found.missed:
+    rows = list[tuple[object, ...]]()
+    brief = list[int]()
+    out_of_reach = list[str]()
+    for o in result.missed:
         requirement = f"{requirement_label(o)} {required_value_text(o)}"
-        brief += range(len(rows), len(rows) + min(len(o.change), SHOWN))
+        brief += range(len(rows), len(rows) + min(len(o.change), CHANGES_SHOWN))
         for c in o.change:
             unit = f"C ({c.after / COULOMB_PER_MAH:.0f} mAh)" if c.unit == "C" else c.unit
             percent, breaks = 100 * (c.after / c.before - 1), ", ".join(c.breaks) or "nothing more"
             rows.append((requirement, f"`{c.parameter}`", c.before, c.after, unit, percent, breaks))
-        hopeless += [requirement] * (not o.change)
+        out_of_reach += [requirement] * (not o.change)
     more = f", {len(rows) - len(brief)} more in result.json" if len(rows) > len(brief) else ""
     title = f"changes of a single parameter that would meet them{more}"
-    hopeless_sentence = f"No change of a single parameter within its bounds meets {', '.join(hopeless)}."
+    out_of_reach_sentence = f"No change of a single parameter within its bounds meets {', '.join(out_of_reach)}."
     return (
         catalogue.note("check.changes"),
         catalogue.table("check.change", rows, title=title, brief=brief),
-        *[Note(hopeless_sentence, terminal=True)] * bool(hopeless),
+        *[Note(out_of_reach_sentence, terminal=True)] * bool(out_of_reach),
     )
 
 
@@ -183,14 +189,14 @@ class SizeResult:
     """Designs for some requirements.
 
     Attributes:
-        asked: the requirements.
+        requirements: the requirements.
         robot: initial robot of the search.
         sizing: result of the search.
         objectives: minimised numbers.
         outcomes: results of `check` for the best design, empty without one.
     """
 
-    asked: Requirements
+    requirements: Requirements
     robot: Robot
     sizing: SizingResult
     objectives: Names
@@ -198,29 +204,36 @@ class SizeResult:
 
     def statement(self) -> str:
         """The answer: the best design and its binding limits, or the nearest design and the limits that it misses."""
-        s = self.sizing
-        left_out = f" No parts meet the requirement on {' or '.join(s.unmeetable)} (dropped)." if s.unmeetable else ""
-        if s.best is None:
+        sizing = self.sizing
+        dropped_sentence = (
+            f" No parts meet the requirement on {' or '.join(sizing.unmeetable)} (dropped)."
+            if sizing.unmeetable
+            else ""
+        )
+        if sizing.best is None:
 
-            def shortfall(f: SizedDesign) -> float:
-                return sum(max(-m, 0.0) for m in f.margins.values())
+            def shortfall(design: SizedDesign) -> float:
+                return sum(max(-m, 0.0) for m in design.margins.values())
 
-            nearest = min(s.motors.values(), key=shortfall, default=None)
-            why = "" if nearest is None else (
+            nearest = min(sizing.motors.values(), key=shortfall, default=None)
+            nearest_sentence = "" if nearest is None else (
                 f" The nearest, {describe_design(nearest)}, misses {', '.join(missed_limits(nearest))}."
             )  # fmt: skip
-            return f"{catalogue.text('size.none')}{why}{left_out}"
-        missing = [requirement_label(o) for o in self.outcomes if not (o.met or requirement_label(o) in s.unmeetable)]
-        binds = f" Binding limits: {', '.join(s.best.binds) or 'none'}."
-        binds += f" It misses {', '.join(missing)}." if missing else ""
-        return f"{describe_design(s.best)}: {objective_text(s.best, s.objective)}.{binds}{left_out}"
+            return f"{catalogue.text('size.none')}{nearest_sentence}{dropped_sentence}"
+        missing = [
+            requirement_label(o) for o in self.outcomes if not (o.met or requirement_label(o) in sizing.unmeetable)
+        ]
+        limits_sentence = f" Binding limits: {', '.join(sizing.best.binds) or 'none'}."
+        limits_sentence += f" It misses {', '.join(missing)}." if missing else ""
+        design = f"{describe_design(sizing.best)}: {objective_text(sizing.best, sizing.objective)}."
+        return f"{design}{limits_sentence}{dropped_sentence}"
 
     def to_json(self) -> Json:
         """`result.json`."""
         return {
             "schema": "mmrjax.size/2",
             "statement": self.statement(),
-            **writing.entries_of(self, "source=asked.source", "objectives"),
+            **writing.entries_of(self, "source=requirements.source", "objectives"),
             **writing.entries_of(self.sizing, "unmeetable", "best", "ideal", "alternatives"),
             "motors": list(self.sizing.motors.values()),
             **writing.entries_of(self, "pareto=sizing.front", "requirements=outcomes"),
@@ -228,29 +241,29 @@ class SizeResult:
         }
 
 
-def design_verdict(found: SizedDesign, unmeetable: Names) -> str:
+def design_verdict(design: SizedDesign, unmeetable: Names) -> str:
     """Verdict on a design. `unmeetable`: requirements that no choice of parts meets, which were ignored."""
-    return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
+    return "misses" if not design.feasible else "meets the others" if unmeetable else "meets"
 
 
-def missed_limits(found: SizedDesign) -> list[str]:
+def missed_limits(design: SizedDesign) -> list[str]:
     """Limits that a design misses, with their margins."""
-    return [f"{label} ({100 * m:+.1f} %)" for label, m in sorted(found.margins.items(), key=lambda x: x[1]) if m < 0]
+    return [f"{label} ({100 * m:+.1f} %)" for label, m in sorted(design.margins.items(), key=lambda x: x[1]) if m < 0]
 
 
-def describe_design(found: SizedDesign) -> str:
+def describe_design(design: SizedDesign) -> str:
     """Motor, gearbox, ratio, radius and cells of a design."""
-    stages = count_noun(found.drive.stages, "stage")
+    stages = count_noun(design.drive.stages, "stage")
     return (
-        f"{found.drive.motor.name}, {found.drive.family} with {stages}, ratio {found.ratio:.4g}, radius "
-        f"{1000 * found.radius:.1f} mm, {found.in_series} × {found.parallel:.3g} {found.cell.name}"
+        f"{design.drive.motor.name}, {design.drive.family} with {stages}, ratio {design.ratio:.4g}, radius "
+        f"{1000 * design.radius:.1f} mm, {design.in_series} × {design.parallel:.3g} {design.cell.name}"
     )
 
 
-def objective_text(found: SizedDesign, name: str) -> str:
+def objective_text(design: SizedDesign, name: str) -> str:
     """Objective with its unit, or `not stated` if no data sheet states it."""
-    unit, words = OBJECTIVES[name]
-    return f"{words} {found.objectives[name]:.4g} {unit}" if name in found.objectives else f"{words} not stated"
+    unit, label = OBJECTIVES[name]
+    return f"{label} {design.objectives[name]:.4g} {unit}" if name in design.objectives else f"{label} not stated"
 
 
 _HEADINGS = {"mass": "mass", "energy": "energy", "cost": "price of motors and gearboxes"}
@@ -264,51 +277,57 @@ COLUMNS = columns(
 ALTERNATIVES, NEXT = 5, 2
 
 
-def size_document(found: SizeResult, robot_name: str) -> Document:
+def size_document(result: SizeResult, robot_name: str) -> Document:
     """Report of a search that started from the named robot."""
-    s, objective_words = found.sizing, ", ".join(OBJECTIVES[name][1] for name in found.objectives)
+    sizing = result.sizing
+    objective_words = ", ".join(OBJECTIVES[name][1] for name in result.objectives)
     lead = (
-        f"Requirements: **{found.asked.source}**. Starting from: **{robot_name}**. Minimised: **{objective_words}**. "
-        f"{s.evaluated:,} designs were evaluated."
+        f"Requirements: **{result.requirements.source}**. Starting from: **{robot_name}**. Minimised: "
+        f"**{objective_words}**. {sizing.evaluated:,} designs were evaluated."
     )
-    best = () if s.best is None else (s.best, *s.alternatives)
-    about = catalogue.note("size.designs" if best else "size.none")
-    tables = _table("best", found, best), requirements_sheet(found.outcomes, terminal=False)
-    motors = _table("by_motor", found, s.motors.values(), "best design of each motor, the first five", terminal=True)
-    designs = [f"{describe_design(f)} ({objective_text(f, s.objective)})" for f in s.alternatives]
+    best = () if sizing.best is None else (sizing.best, *sizing.alternatives)
+    introduction = catalogue.note("size.designs" if best else "size.none")
+    tables = _table("best", result, best), requirements_sheet(result.outcomes, terminal=False)
+    motors = _table(
+        "by_motor", result, sizing.motors.values(), "best design of each motor, the first five", terminal=True
+    )
+    designs = [
+        f"{describe_design(design)} ({objective_text(design, sizing.objective)})" for design in sizing.alternatives
+    ]
     next_best = (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
-    front_words: Names = ()
-    if s.front:
-        (first, second), (low, *_, high) = found.objectives, (s.front[0], *s.front)
-        front_words = (
-            f"{count_noun(len(s.front), 'design')} on the Pareto front of {first} and {second}, from "
+    front_sentences: Names = ()
+    if sizing.front:
+        (first, second) = result.objectives
+        (low, *_, high) = (sizing.front[0], *sizing.front)
+        front_sentences = (
+            f"{count_noun(len(sizing.front), 'design')} on the Pareto front of {first} and {second}, from "
             f"{objective_text(low, first)} to {objective_text(high, second)}.",
         )
-    front = [b for x in front_words for b in (Note(x, terminal=True), _table("front", found, s.front))]
+    front = [b for x in front_sentences for b in (Note(x, terminal=True), _table("front", result, sizing.front))]
     sections = [
-        Section("Designs", (about, *tables), "designs"),
+        Section("Designs", (introduction, *tables), "designs"),
         Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
     ]
-    if s.best is not None:
-        sections.append(Section("Motor and gear", (_chart(s.best.robot, found.outcomes),)))
+    if sizing.best is not None:
+        sections.append(Section("Motor and gear", (_chart(sizing.best.robot, result.outcomes),)))
     return Document(
-        "Sizing", found.statement(), (Note(lead, "lead"), *front), tuple(sections),
-        brief=(lead, *next_best, *front_words),
+        "Sizing", result.statement(), (Note(lead, "lead"), *front), tuple(sections),
+        brief=(lead, *next_best, *front_sentences),
     )  # fmt: skip
 
 
 def _table(
-    name: str, found: SizeResult, designs: Iterable[SizedDesign], title: str = "", terminal: bool = False
+    name: str, result: SizeResult, designs: Iterable[SizedDesign], title: str = "", terminal: bool = False
 ) -> Table:
-    left_out = found.sizing.unmeetable
+    unmeetable = result.sizing.unmeetable
     rows = [
         (
-            Cell(design_verdict(f, left_out), ("fair" if left_out else "good") if f.feasible else "bad"),
-            f.drive.motor.name,
-            f"{f.drive.family}, {count_noun(f.drive.stages, 'stage')}", f.ratio, 1000 * f.radius,
-            f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *(f.objectives.get(k) for k in OBJECTIVES),
-            ", ".join(f.binds if f.feasible else missed_limits(f)) or "none",
+            Cell(design_verdict(d, unmeetable), ("fair" if unmeetable else "good") if d.feasible else "bad"),
+            d.drive.motor.name,
+            f"{d.drive.family}, {count_noun(d.drive.stages, 'stage')}", d.ratio, 1000 * d.radius,
+            f"{d.in_series} × {d.parallel:.3g} {d.cell.name}", *(d.objectives.get(k) for k in OBJECTIVES),
+            ", ".join(d.binds if d.feasible else missed_limits(d)) or "none",
         )
-        for f in designs
+        for d in designs
     ]  # fmt: skip
     return Table(name, COLUMNS, rows, title, terminal=terminal, brief=range(min(ALTERNATIVES, len(rows))))

@@ -41,20 +41,20 @@ def footing_coordinates(table: Columns) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class Along:
+class DerivativeVariables:
     """Variables with respect to which derivatives are computed.
 
     Attributes:
         names, units: names and units of the values.
         values, widths: values and widths in these units.
-        given: function that returns the inputs of a run with such values.
+        inputs: function that returns the inputs of a run with such values.
     """
 
     names: Names
     units: Names
     values: Array
     widths: Array
-    given: Callable[[Array], ClimbInputs]
+    inputs: Callable[[Array], ClimbInputs]
 
     @property
     def rows(self) -> list[tuple[str, str, float, float]]:
@@ -81,7 +81,7 @@ class ClimbResult:
         tried: sizes [mm] and verdicts of a search.
         largest: largest climbed size [mm]. None: no search, or none was climbed.
         sought: name of the searched size. Empty: no search.
-        along, derivatives: None unless requested.
+        variables, derivatives: None unless requested.
     """
 
     robot: Robot
@@ -92,7 +92,7 @@ class ClimbResult:
     tried: tuple[tuple[float, str], ...] = ()
     largest: float | None = None
     sought: str = ""
-    along: Along | None = None
+    variables: DerivativeVariables | None = None
     derivatives: ClimbDerivatives | None = None
 
     @property
@@ -103,13 +103,13 @@ class ClimbResult:
     @functools.cached_property
     def table(self) -> Columns:
         """Table of the run over time."""
-        r: Any = self.climb.run(0)
-        q, v = r.motion.q, r.motion.v
-        energy = {f"{name}_J": r.energy[name] for name in (*SOURCES, *LOSSES)}
+        record: Any = self.climb.run(0)
+        q, v = record.motion.q, record.motion.v
+        energy = {f"{name}_J": record.energy[name] for name in (*SOURCES, *LOSSES)}
         sides = float(self.robot.sides)
         radius = float(self.robot.radius_pulley)
         return {
-            "time_s": r.time,
+            "time_s": record.time,
             "x_mm": 1000 * q[:, 0],
             "z_mm": 1000 * q[:, 1],
             "pitch_deg": -np.degrees(q[:, PITCH]),
@@ -118,21 +118,21 @@ class ClimbResult:
             "rear_deg": 180 - np.degrees(q[:, REAR]),
             "speed_mm_s": 1000 * np.hypot(v[:, 0], v[:, 1]),
             "belt_mm_s": 1000 * radius * v[:, SHAFT],
-            "traction_current_A": r.current,
-            "front_current_A": r.lever_current[:, 0],
-            "rear_current_A": r.lever_current[:, 1],
-            "motors_current_A": r.total_current,
-            "front_voltage_V": r.lever_voltage[:, 0],
-            "rear_voltage_V": r.lever_voltage[:, 1],
-            "front_holds": r.holds[:, 0],
-            "rear_holds": r.holds[:, 1],
-            "front_torque_Nm": r.torque[:, 0],
-            "rear_torque_Nm": r.torque[:, 1],
-            "margin_mm": 1000 * r.margin,
-            "reaction_N": sides * r.normal,
-            "body_share": r.body,
+            "traction_current_A": record.current,
+            "front_current_A": record.lever_current[:, 0],
+            "rear_current_A": record.lever_current[:, 1],
+            "motors_current_A": record.total_current,
+            "front_voltage_V": record.lever_voltage[:, 0],
+            "rear_voltage_V": record.lever_voltage[:, 1],
+            "front_holds": record.holds[:, 0],
+            "rear_holds": record.holds[:, 1],
+            "front_torque_Nm": record.torque[:, 0],
+            "rear_torque_Nm": record.torque[:, 1],
+            "margin_mm": 1000 * record.margin,
+            "reaction_N": sides * record.normal,
+            "body_share": record.body,
             **energy,
-            "stored_J": r.stored - r.stored[0],
+            "stored_J": record.stored - record.stored[0],
         }
 
     @property
@@ -146,15 +146,14 @@ class ClimbResult:
     @property
     def slopes(self) -> list[Json] | None:
         """Derivatives, one row for each output and variable. None unless requested."""
-        variables, d = self.along, self.derivatives
-        if variables is None or d is None:
+        variables, derivatives = self.variables, self.derivatives
+        if variables is None or derivatives is None:
             return None
         return [
             {
-                "output": name, "unit": unit, "value": d.outputs[name],
-                "by": by, "by_unit": by_unit, "by_value": value, "by_width": width,
-                "derivative": float(d.derivatives[name][k]), "slope": float(d.slope[name][k]),
-                "slope_sd": float(d.slope_sd[name][k]),
+                "output": name, "unit": unit, "value": derivatives.outputs[name], "by": by, "by_unit": by_unit,
+                "by_value": value, "by_width": width, "derivative": float(derivatives.derivatives[name][k]),
+                "slope": float(derivatives.slope[name][k]), "slope_sd": float(derivatives.slope_sd[name][k]),
             }
             for name, (unit, _) in OUTPUTS.items()
             for k, (by, by_unit, value, width) in enumerate(variables.rows)
@@ -168,22 +167,24 @@ class ClimbResult:
                 return f"It cannot climb any {self.sought} that was tried. The smallest was {smallest:.0f} mm."
             larger_sizes = [(s, v) for s, v in self.tried if s > self.largest]
             next_larger = min(larger_sizes, default=None)
-            why = "" if next_larger is None else f"; at {next_larger[0]:.0f} mm it {VERDICTS[next_larger[1]][0]}"
-            return f"The largest {self.sought} that it gets over is {self.largest:.0f} mm{why}."
-        short, meaning = VERDICTS[self.verdict]
-        return f"The robot {short}: {self.obstacle}" + ("." if self.verdict == "over" else f"; {meaning}.")
+            next_larger_text = (
+                "" if next_larger is None else f"; at {next_larger[0]:.0f} mm it {VERDICTS[next_larger[1]][0]}"
+            )
+            return f"The largest {self.sought} that it gets over is {self.largest:.0f} mm{next_larger_text}."
+        phrase, meaning = VERDICTS[self.verdict]
+        return f"The robot {phrase}: {self.obstacle}" + ("." if self.verdict == "over" else f"; {meaning}.")
 
     def numbers(self) -> dict[str, float]:
         """Largest and final numbers of the run that is shown."""
-        t = self.table
-        levers, tracks = (float(t[name][-1] - t[name][0]) for name in ("levers_J", "supply_J"))
+        table = self.table
+        levers, tracks = (float(table[name][-1] - table[name][0]) for name in ("levers_J", "supply_J"))
         return {
-            "time_s": float(t["time_s"][-1]),
+            "time_s": float(table["time_s"][-1]),
             "furthest_mm": float(1000 * self.climb.furthest[0]),
-            "pitch_most_deg": float(t["pitch_deg"].max()),
-            "pitch_least_deg": float(t["pitch_deg"].min()),
-            "margin_least_mm": float(np.fmin.reduce(t["margin_mm"])),
-            **{f"{name}_most_{unit}": float(np.abs(t[f"{name}_{unit}"]).max()) for name, unit in _LARGEST},
+            "pitch_most_deg": float(table["pitch_deg"].max()),
+            "pitch_least_deg": float(table["pitch_deg"].min()),
+            "margin_least_mm": float(np.fmin.reduce(table["margin_mm"])),
+            **{f"{name}_most_{unit}": float(np.abs(table[f"{name}_{unit}"]).max()) for name, unit in _LARGEST},
             "energy_levers_J": levers,
             "energy_J": tracks + levers,
         }
@@ -214,42 +215,42 @@ class ClimbResult:
 SHOWN = ("margin_success", "crest_time_s", "crest_energy_J", "crest_current_rms_A")
 
 
-def climb_document(found: ClimbResult, file: RobotFile) -> Document:
+def climb_document(result: ClimbResult, file: RobotFile) -> Document:
     """Report of a climb."""
-    lead = f"**{found.configuration}**, {found.obstacle}, approached at a right angle."
-    tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried)
+    lead = f"**{result.configuration}**, {result.obstacle}, approached at a right angle."
+    tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in result.tried)
     blocks: tuple[Block, ...] = (
         run_tables.note_on_robot(file, more=lead),
         *[Note(f"{tried}.", terminal=True)] * bool(tried),
-        catalogue.figure("climb.silhouettes", found),
-        catalogue.figure("climb.course", found),
+        catalogue.figure("climb.silhouettes", result),
+        catalogue.figure("climb.course", result),
     )
-    return Document("Over an obstacle", found.statement(), blocks, tuple(_sections(found)))
+    return Document("Over an obstacle", result.statement(), blocks, tuple(_sections(result)))
 
 
-def _sections(found: ClimbResult) -> Iterable[Section]:
+def _sections(result: ClimbResult) -> Iterable[Section]:
     numbers = []
-    for name, value in found.numbers().items():
-        words, _, unit = name.rpartition("_")
-        words = words.replace("_most", ", largest").replace("_least", ", least").replace("_", " ")
-        numbers.append((words, value, unit))
-    of_run = catalogue.table("climb.run", numbers)
-    yield Section("The run in numbers", (of_run, catalogue.note("climb.belts")), "numbers")
-    if found.margins:
-        rows = [(n.removeprefix("margin_"), 100 * value, OUTPUTS[n][1]) for n, value in found.margins.items()]
-        shares = catalogue.table("climb.shares", rows)
-        yield Section("Margins", (shares, catalogue.note("climb.least")), "margins")
-    if found.along is not None:
-        derivatives = _derivatives(found.slopes or [], found.along)
+    for name, value in result.numbers().items():
+        label, _, unit = name.rpartition("_")
+        label = label.replace("_most", ", largest").replace("_least", ", least").replace("_", " ")
+        numbers.append((label, value, unit))
+    run_table = catalogue.table("climb.run", numbers)
+    yield Section("The run in numbers", (run_table, catalogue.note("climb.belts")), "numbers")
+    if result.margins:
+        rows = [(n.removeprefix("margin_"), 100 * value, OUTPUTS[n][1]) for n, value in result.margins.items()]
+        margin_table = catalogue.table("climb.shares", rows)
+        yield Section("Margins", (margin_table, catalogue.note("climb.least")), "margins")
+    if result.variables is not None:
+        derivatives = _derivatives(result.slopes or [], result.variables)
         yield Section("Derivatives", (derivatives, catalogue.note("climb.slopes")), "derivatives")
 
 
-def _derivatives(slopes: Sequence[Json], along: Along) -> Table:
+def _derivatives(slopes: Sequence[Json], variables: DerivativeVariables) -> Table:
     rows: dict[str, list[Any]] = {}
-    for s in slopes:
-        label = s["output"] if s["unit"] == "-" else f"{s['output']} [{s['unit']}]"
-        cells = rows.setdefault(s["output"], [label, s["value"]])
-        cells.append(f"{s['derivative']:.3g} ({s['slope']:.3g} ± {s['slope_sd']:.1g})")
-    heads = (f"by {n} = {v:.4g} {u}, over ±{w:.2g} |".replace(" ,", ",") for n, u, v, w in along.rows)
+    for slope in slopes:
+        label = slope["output"] if slope["unit"] == "-" else f"{slope['output']} [{slope['unit']}]"
+        cells = rows.setdefault(slope["output"], [label, slope["value"]])
+        cells.append(f"{slope['derivative']:.3g} ({slope['slope']:.3g} ± {slope['slope_sd']:.1g})")
+    heads = (f"by {n} = {v:.4g} {u}, over ±{w:.2g} |".replace(" ,", ",") for n, u, v, w in variables.rows)
     brief = [k for k, name in enumerate(rows) if name in SHOWN]
     return catalogue.table("climb.slopes-table", list(rows.values()), *heads, brief=brief)

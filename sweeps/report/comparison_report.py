@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data import Columns, Json, Names
 from calibration.data.runs import Runs
-from calibration.inference import simulation_errors as residual
+from calibration.inference import simulation_errors as simulation_errors
 from mmrjax.errors import count_noun
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
@@ -70,7 +70,7 @@ def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = N
         if measured.has(channel.sd_column):
             table[channel.sd_column] = measured[channel.sd_column]
         table[f"simulated_{channel.column}"] = simulated[channel.column]
-        table[f"error_{channel.name}_percent"] = residual.sized_error(
+        table[f"error_{channel.name}_percent"] = simulation_errors.sized_error(
             simulated[channel.column], table[channel.column]
         )
     table["status"] = simulated["status"]
@@ -85,107 +85,127 @@ def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = N
 
 
 def _summary(channel: Channel, table: Columns) -> Json:
-    measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
+    measured = table[channel.column]
+    simulated = table[f"simulated_{channel.column}"]
     return {
-        **residual.error_summary(table[f"error_{channel.name}_percent"]),
-        "rms": residual.root_mean_square(simulated - measured),
+        **simulation_errors.error_summary(table[f"error_{channel.name}_percent"]),
+        "rms": simulation_errors.root_mean_square(simulated - measured),
         "unit": channel.unit,
-        "r2": residual.r_squared(measured, simulated),
+        "r2": simulation_errors.r_squared(measured, simulated),
         "missing": int(np.isnan(measured).sum()),
     }
 
 
-def comparison_document(found: Comparison) -> Document:
+def comparison_document(comparison: Comparison) -> Document:
     """Report of a comparison."""
-    table, status = found.table, found.table["status"]
+    table = comparison.table
+    status = comparison.table["status"]
     lead = (
-        f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
+        f"Robot: **{comparison.robot_name}**. Fidelity: **{comparison.model}**. Measured: **{comparison.source}**, "
         f"{count_noun(len(status), 'row')}."
     )
-    known_sd = any(np.isfinite(table.get(c.sd_column, [])).any() for c in found.channels)
-    band = " Band: ±2 standard deviations of the readings." * known_sd
-    errors = catalogue.figure("comparison.errors", table, found.channels, more=band)
+    has_sd = any(np.isfinite(table.get(c.sd_column, [])).any() for c in comparison.channels)
+    band = " Band: ±2 standard deviations of the readings." * has_sd
+    error_figure = catalogue.figure("comparison.errors", table, comparison.channels, more=band)
     rows = []
-    groups = dict(list(found.summary.items())[: None if len(found.summary) > 2 else 1])  # one equals the total
+    groups = dict(
+        list(comparison.summary.items())[: None if len(comparison.summary) > 2 else 1]
+    )  # one equals the total
     for group, by_channel in groups.items():
-        for channel in found.channels:
-            e = by_channel[channel.name]
-            rms = None if is_missing(e["rms"]) else f"{e['rms']:.{channel.resolution}f} {channel.unit}"
-            rows.append((group, channel.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
-    ends = [
+        for channel in comparison.channels:
+            summary = by_channel[channel.name]
+            rms = None if is_missing(summary["rms"]) else f"{summary['rms']:.{channel.resolution}f} {channel.unit}"
+            rows.append(
+                (
+                    group,
+                    channel.label,
+                    summary["rows"],
+                    rms,
+                    summary["rms_percent"],
+                    summary["max_percent"],
+                    summary["r2"],
+                )
+            )
+    ending_sentences = [
         f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; {words.status_meaning(name)}."
         for name, count in Counter(map(str, status)).items()
         if name not in words.SETTLED
     ]
-    marks = [Cell(words.short_status(s), "" if s in words.SETTLED else "slides") for s in map(str, status)]
+    status_cells = [Cell(words.short_status(s), "" if s in words.SETTLED else "slides") for s in map(str, status)]
     kinds = {"": "measured", "simulated_": "simulated"}
     return Document(
-        f"{found.robot_name} against {found.source}",
-        comparison_answer(found),
+        f"{comparison.robot_name} against {comparison.source}",
+        comparison_answer(comparison),
         (
             Note(lead, "lead"),
-            *(Note(text, "warn", terminal=True) for text in ends),
+            *(Note(text, "warn", terminal=True) for text in ending_sentences),
             catalogue.table("comparison.errors", rows),
             catalogue.note("comparison.errors-note"),
-            *remarks(found.notes),
+            *remarks(comparison.notes),
         ),
         (
-            *_over_time(found),
-            Section("Errors against conditions", (errors,)),
+            *_over_time(comparison),
+            Section("Errors against conditions", (error_figure,)),
             fit_tables.rows_section(
-                table, found.channels, kinds, True, mass=True, last={"status": marks}, file="comparison.csv",
-                terminal=True,
+                table, comparison.channels, kinds, True, mass=True, last={"status": status_cells},
+                file="comparison.csv", terminal=True,
             ),
         ),
     )  # fmt: skip
 
 
-def _over_time(found: Comparison) -> tuple[Section, ...]:
+def _over_time(comparison: Comparison) -> tuple[Section, ...]:
     """Section with the readings of a log over time. None for a table of settled runs."""
-    if not found.sampled:
+    if not comparison.sampled:
         return ()
     lines = {"simulated_": "simulated"}
-    if found.against:
-        lines = {"simulated_": found.robot_name, "against_": found.against}
-    fits = fit_tables.fits_of_runs(found.table, found.channels, lines)
-    if found.after_steps is not None and 0 < np.count_nonzero(found.after_steps) < len(found.after_steps):
-        rest = {column: values[~found.after_steps] for column, values in found.table.items()}
-        apart = {prefix: f"{name}, without the two samples after each step" for prefix, name in lines.items()}
-        rows = [*fits.rows, *fit_tables.fits_of_runs(rest, found.channels, apart).rows]
+    if comparison.against:
+        lines = {"simulated_": comparison.robot_name, "against_": comparison.against}
+    fits = fit_tables.fits_of_runs(comparison.table, comparison.channels, lines)
+    if comparison.after_steps is not None and 0 < np.count_nonzero(comparison.after_steps) < len(
+        comparison.after_steps
+    ):
+        away_from_steps = {column: values[~comparison.after_steps] for column, values in comparison.table.items()}
+        lines_away = {prefix: f"{name}, without the two samples after each step" for prefix, name in lines.items()}
+        rows = [*fits.rows, *fit_tables.fits_of_runs(away_from_steps, comparison.channels, lines_away).rows]
         fits = dataclasses.replace(fits, rows=sorted(rows, key=lambda row: row[0]))
-    answer = comparison_answer(found)
-    overlay = catalogue.figure("fit.overlay", found.table, found.channels, lines, finding=answer)
+    answer = comparison_answer(comparison)
+    overlay = catalogue.figure("fit.overlay", comparison.table, comparison.channels, lines, finding=answer)
     return (Section("Over time", (overlay, fits)),)
 
 
-def comparison_answer(found: Comparison) -> str:
+def comparison_answer(comparison: Comparison) -> str:
     """The rms errors with their numbers of rows, the worst reading, and if the robot was fitted to these rows."""
-    error_summary, total = found.summary["all"], len(found.table["status"])
-    channel_errors = {c.label: error_summary[c.name] for c in found.channels if error_summary[c.name]["rows"]}
+    error_summary = comparison.summary["all"]
+    total = len(comparison.table["status"])
+    channel_errors = {c.label: error_summary[c.name] for c in comparison.channels if error_summary[c.name]["rows"]}
     if not channel_errors:
         return "No row has a simulated and a measured value."
     errors = ", ".join(f"{e['rms_percent']:.1f} % {label}" for label, e in channel_errors.items())
     rows, worst = (max(e[name] for e in channel_errors.values()) for name in ("rows", "max_percent"))
-    extent_words = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
-    if found.sampled:
-        runs = Runs(found.source, {k: found.table[k] for k in ("run_id", "time_s") if k in found.table})
-        extent_words = f"{sum(np.ptp(runs['time_s'][r]) for r in runs.rows_by_run().values()):.3g} s of log"
-    parts = [f"{extent_words}: rms error {errors} (worst reading {worst:.1f} %)."]
-    parts += [catalogue.text(f"comparison.{found.fit}")] if found.fit else []
-    return " ".join([*parts, *([_second_robot(found)] if found.against else [])])
+    extent = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
+    if comparison.sampled:
+        runs = Runs(
+            comparison.source, {k: comparison.table[k] for k in ("run_id", "time_s") if k in comparison.table}
+        )
+        extent = f"{sum(np.ptp(runs['time_s'][r]) for r in runs.rows_by_run().values()):.3g} s of log"
+    parts = [f"{extent}: rms error {errors} (worst reading {worst:.1f} %)."]
+    parts += [catalogue.text(f"comparison.{comparison.fit}")] if comparison.fit else []
+    return " ".join([*parts, *([_second_robot(comparison)] if comparison.against else [])])
 
 
-def _second_robot(found: Comparison) -> str:
+def _second_robot(comparison: Comparison) -> str:
     """Errors of both robots on the rows for which both have values."""
-    parts, most = [], 0
-    for c in found.channels:
-        both = np.stack([found.table[prefix + c.column] for prefix in ("simulated_", "against_")], 1)
-        measured = found.table[c.column]
-        rows = np.isfinite(both).all(1) & np.isfinite(measured)
+    parts = []
+    compared_rows = 0
+    for c in comparison.channels:
+        simulated = np.stack([comparison.table[prefix + c.column] for prefix in ("simulated_", "against_")], 1)
+        measured = comparison.table[c.column]
+        rows = np.isfinite(simulated).all(1) & np.isfinite(measured)
         if rows.any():
-            first, second = 100 * residual.share_of_measured(both[rows], measured[rows, None])
+            first, second = 100 * simulation_errors.share_of_measured(simulated[rows], measured[rows, None])
             parts.append(f"{c.label} {first:.1f} and {second:.1f} %")
-            most = max(most, int(rows.sum()))
+            compared_rows = max(compared_rows, int(rows.sum()))
     if not parts:
-        return f"No row has values for both this robot and {found.against}."
-    return f"This robot and {found.against} on the same {count_noun(most, 'row')}: {', '.join(parts)}."
+        return f"No row has values for both this robot and {comparison.against}."
+    return f"This robot and {comparison.against} on the same {count_noun(compared_rows, 'row')}: {', '.join(parts)}."

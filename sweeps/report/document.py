@@ -186,7 +186,7 @@ class Figure:
     Attributes:
         name: name of its element and file.
         alternative: its finding in words, for readers who cannot see it.
-        caption: how to read it.
+        caption: explanation of the figure.
         draw: function that returns the matplotlib figure.
     """
 

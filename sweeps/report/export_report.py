@@ -22,27 +22,29 @@ from sweeps.report.document import Cell, Document, Note, Section, Table, remarks
 TONES = {HELD: "good", APPROXIMATED: "fair", DROPPED: "bad"}
 
 
-def export_document(found: Export) -> Document:
+def export_document(export: Export) -> Document:
     """Report of an exported drive."""
-    compared = found.comparison
-    fates = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
-    rim = catalogue.note("export.rim", errors_title(found).capitalize())
-    kept = catalogue.table("export.fates", fates), catalogue.note("export.kept")
-    sections = [
-        Section("What the format represents", kept, "holds"),
-        Section("Errors", (_errors(found), rim), "errors"),
+    comparison = export.comparison
+    fates = [
+        (fate.name, Cell(fate.verdict, TONES[fate.verdict]), 100 * fate.kept, fate.how) for fate in comparison.fates
     ]
-    if compared.refitted:
-        table = catalogue.table("export.fitted", _fitted(found))
+    rim_note = catalogue.note("export.rim", errors_title(export).capitalize())
+    fate_blocks = catalogue.table("export.fates", fates), catalogue.note("export.kept")
+    sections = [
+        Section("What the format represents", fate_blocks, "holds"),
+        Section("Errors", (_errors(export), rim_note), "errors"),
+    ]
+    if comparison.refitted:
+        table = catalogue.table("export.fitted", _fitted(export))
         sections.append(Section("Parameters of the format", (table, catalogue.note("export.fitted"))))
-    if found.checks:
-        sections.append(Section("Checks of the files", (catalogue.table("export.checks", [*found.checks.items()]),)))
-    rows = [(f"`{c.name}`", c.value, c.unit, c.interval or None, c.meaning, c.source) for c in found.constants]
-    conditions = Note(tuple(conditions_seen(found)), name="seen"), Note(tuple(not_tested(found)), name="untested")
+    if export.checks:
+        sections.append(Section("Checks of the files", (catalogue.table("export.checks", [*export.checks.items()]),)))
+    rows = [(f"`{c.name}`", c.value, c.unit, c.interval or None, c.meaning, c.source) for c in export.constants]
+    conditions = Note(tuple(conditions_seen(export)), name="seen"), Note(tuple(not_tested(export)), name="untested")
     return Document(
-        f"{found.joint.file.name} for {found.format}",
-        export_statement(found),
-        (Note(_usage(found), "lead"), *remarks(export_remarks(found))),
+        f"{export.joint.file.name} for {export.format}",
+        export_statement(export),
+        (Note(_usage(export), "lead"), *remarks(export_remarks(export))),
         (
             *sections,
             Section("Constants", (catalogue.table("export.constants", rows),)),
@@ -51,22 +53,22 @@ def export_document(found: Export) -> Document:
     )
 
 
-def _usage(found: Export) -> str:
+def _usage(export: Export) -> str:
     """Use of the format's files, as a paragraph."""
-    return catalogue.text(f"export.use-{found.format}", found.joint.name, rotor_inertia(found))
+    return catalogue.text(f"export.use-{export.format}", export.joint.name, rotor_inertia(export))
 
 
-def _fitted(found: Export) -> list[tuple[str, float, float]]:
+def _fitted(export: Export) -> list[tuple[str, float, float]]:
     """Parameters of the format: name, translated and refitted value."""
-    return [(n, found.comparison.translated[n], v) for n, v in found.comparison.refitted.items()]
+    return [(n, export.comparison.translated[n], v) for n, v in export.comparison.refitted.items()]
 
 
-def _errors(found: Export) -> Table:
-    errors = found.comparison.errors
+def _errors(export: Export) -> Table:
+    errors = export.comparison.errors
     names = list(next(iter(errors.values())))
     heads = (f"{channels.find_channel(n).label} [%] | .3g" for n in names)
     rows = [(label, *map(percent.get, names)) for label, percent in errors.items()]
-    return catalogue.table("export.error-table", rows, *heads, title=errors_title(found))
+    return catalogue.table("export.error-table", rows, *heads, title=errors_title(export))
 
 
 #: Readings that a controller compares with its setpoint, their units, and the last term of its duty.
@@ -82,59 +84,59 @@ NOT_TESTED = (
 BACKWARD = "Runs in which the load drives the motor."
 
 
-def export_statement(found: Export) -> str:
+def export_statement(export: Export) -> str:
     """One sentence: the exported drive, and its error compared with the native model."""
-    compared = found.comparison
-    exported, native = compared.errors[EXPORTED], compared.errors[NATIVE]
-    channels_shown = ", ".join(
-        f"{channels.find_channel(n).label} {three_digits(exported[n])} %"
-        + (f" (native {three_digits(native[n])} %)" if compared.situation.is_measured else "")
-        for n in exported
+    comparison = export.comparison
+    export_errors, native_errors = comparison.errors[EXPORTED], comparison.errors[NATIVE]
+    errors_text = ", ".join(
+        f"{channels.find_channel(name).label} {three_digits(export_errors[name])} %"
+        + (f" (native {three_digits(native_errors[name])} %)" if comparison.situation.is_measured else "")
+        for name in export_errors
     )
-    drive = found.joint
+    joint = export.joint
     return (
-        f"The drive of {drive.file.name}, {drive.configuration}, as {FORMATS[found.format]}: its error against "
-        f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is "
-        f"{channels_shown or 'unknown: these runs have neither current nor speed'}."
+        f"The drive of {joint.file.name}, {joint.configuration}, as {FORMATS[export.format]}: its error against "
+        f"{comparison.reference} over {count_noun(len(comparison.situation.command), 'run')} is "
+        f"{errors_text or 'unknown: these runs have neither current nor speed'}."
     )
 
 
-def errors_title(found: Export) -> str:
+def errors_title(export: Export) -> str:
     """Title of the table of errors."""
-    compared = found.comparison
-    return f"error against {compared.reference}, rms over rms"
+    comparison = export.comparison
+    return f"error against {comparison.reference}, rms over rms"
 
 
-def export_remarks(found: Export) -> list[str]:
+def export_remarks(export: Export) -> list[str]:
     """Remarks on the reference of the errors, and on what is not exported."""
-    compared, drive = found.comparison, found.joint
-    answer = ["the reference is the native model. Give measured runs with --data"]
-    if compared.situation.is_measured:
-        answer = [
+    comparison, joint = export.comparison, export.joint
+    sentences = ["the reference is the native model. Give measured runs with --data"]
+    if comparison.situation.is_measured:
+        sentences = [
             "the refit used no measurements. Errors are hold-out errors unless the robot was fitted to these runs"
         ]
-    if dropped := [f.name for f in compared.fates if f.verdict == DROPPED]:
-        answer.append(f"dropped: {', '.join(dropped)}")
-    if drive.idle:
-        answer.append(f"{', '.join(drive.idle)}: not exported: no effect in {drive.configuration}")
-    if found.posterior is None and drive.file.source.endswith(".toml"):
-        answer.append("no posterior.nc next to the robot's file: intervals come from the priors")
-    return answer
+    if dropped := [fate.name for fate in comparison.fates if fate.verdict == DROPPED]:
+        sentences.append(f"dropped: {', '.join(dropped)}")
+    if joint.idle:
+        sentences.append(f"{', '.join(joint.idle)}: not exported: no effect in {joint.configuration}")
+    if export.posterior is None and joint.file.source.endswith(".toml"):
+        sentences.append("no posterior.nc next to the robot's file: intervals come from the priors")
+    return sentences
 
 
-def conditions_seen(found: Export) -> list[str]:
+def conditions_seen(export: Export) -> list[str]:
     """Ranges of the compared runs, one line for each."""
-    runs = found.comparison.situation
+    situation = export.comparison.situation
     lines = [
-        f"{count_noun(len(runs.command), 'settled run')} of {runs.source}",
-        f"voltage at the driver's output {_span(runs.command)} V",
-        f"torque at the joint {_span(runs.load)} N·m",
-        f"speed of the joint {_span(runs.inside.speed)} rad/s",
-        f"current of one motor {_span(runs.inside.current)} A",
+        f"{count_noun(len(situation.command), 'settled run')} of {situation.source}",
+        f"voltage at the driver's output {_span(situation.command)} V",
+        f"torque at the joint {_span(situation.load)} N·m",
+        f"speed of the joint {_span(situation.inside.speed)} rad/s",
+        f"current of one motor {_span(situation.inside.current)} A",
     ]
-    if found.joint.robot.has_ground:
-        lines.append(f"slope {_span(np.degrees(np.asarray(runs.signals.slope)))} deg")
-        lines.append(f"normal load of one side {_span(np.asarray(runs.signals.normal))} N")
+    if export.joint.robot.has_ground:
+        lines.append(f"slope {_span(np.degrees(np.asarray(situation.signals.slope)))} deg")
+        lines.append(f"normal load of one side {_span(np.asarray(situation.signals.normal))} N")
     return lines
 
 
@@ -143,63 +145,63 @@ def _span(values: np.ndarray) -> str:
     return f"{low:.4g}" if np.isclose(low, high) else f"{low:.4g} to {high:.4g}"
 
 
-def not_tested(found: Export) -> list[str]:
+def not_tested(export: Export) -> list[str]:
     """Limits of the comparison, one sentence for each."""
-    runs = found.comparison.situation
-    backward = bool(np.any(runs.load * runs.inside.speed < 0))
-    return [*NOT_TESTED, *([] if backward else [BACKWARD])]
+    situation = export.comparison.situation
+    is_driven_by_load = bool(np.any(situation.load * situation.inside.speed < 0))
+    return [*NOT_TESTED, *([] if is_driven_by_load else [BACKWARD])]
 
 
-def rotor_inertia(found: Export) -> float:
+def rotor_inertia(export: Export) -> float:
     """Inertia of the rotor at the joint [kg·m²], or armature of an exported law."""
-    robot = found.joint.robot
-    if found.format == "onnx":
-        law = module_from_source(jax_source(found.joint, found.constants))
+    robot = export.joint.robot
+    if export.format == "onnx":
+        law = module_from_source(jax_source(export.joint, export.constants))
         return float(law.armature(law.PARAMS))
-    value = float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2 * float(robot.gearbox.efficiency_load)
-    return value + sum(float(e.amplitude) for e in found.joint.inside if e.balance == "inertia")
+    inertia = float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2 * float(robot.gearbox.efficiency_load)
+    return inertia + sum(float(e.amplitude) for e in export.joint.inside if e.balance == "inertia")
 
 
 def escape_markdown(text: str) -> str:
     """User's name escaped for Markdown, so that it ends no line, cell or code, and begins no HTML."""
-    words = " ".join(printable(text).split())
-    return words.replace("`", "'").replace("|", "\\|").replace("<", "&lt;")
+    line = " ".join(printable(text).split())
+    return line.replace("`", "'").replace("|", "\\|").replace("<", "&lt;")
 
 
-def law_text(found: Export) -> str:
+def law_text(export: Export) -> str:
     """Text of LAW.md."""
-    drive, compared = found.joint, found.comparison
+    joint, comparison = export.joint, export.comparison
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
-    shares = {f.name: f"{100 * f.kept:.0f} %" if np.isfinite(f.kept) else "" for f in compared.fates}
+    shares = {fate.name: f"{100 * fate.kept:.0f} %" if np.isfinite(fate.kept) else "" for fate in comparison.fates}
     sections = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
                 "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
-    effects = [p for p in drive.parts if p.effect and p.balance in INSIDE]
-    places = {sections[p.balance] for p in effects}
+    effects = [p for p in joint.parts if p.effect and p.balance in INSIDE]
+    sections_with_effects = {sections[p.balance] for p in effects}
     return filled_template(
         "LAW.md",
-        origin=escape_markdown(f"{drive.file.name}, {drive.configuration}"),
+        origin=escape_markdown(f"{joint.file.name}, {joint.configuration}"),
         version=__version__,
-        format=FORMATS[found.format],
-        use=_usage(found),
-        format_name=found.format,
-        joint=drive,
-        ground=drive.robot.has_ground,
+        format=FORMATS[export.format],
+        use=_usage(export),
+        format_name=export.format,
+        joint=joint,
+        ground=joint.robot.has_ground,
         sections=sections,
         effects=effects,
-        less=lambda place: f" - {place} effects" if place in places else "",
-        controller=drive.controller,
-        imposed=drive.robot.rig.imposed,
-        goal=None if drive.controller is None else GOALS[drive.robot.rig.imposed],
-        ratio=float(drive.robot.gearbox.ratio),
+        less=lambda place: f" - {place} effects" if place in sections_with_effects else "",
+        controller=joint.controller,
+        imposed=joint.robot.rig.imposed,
+        goal=None if joint.controller is None else GOALS[joint.robot.rig.imposed],
+        ratio=float(joint.robot.gearbox.ratio),
         mesh_frequency=MESH_FREQUENCY,
         mesh_damping=MESH_DAMPING,
-        constants=[(c, escape_markdown(c.name), escape_markdown(c.source)) for c in found.constants],
-        cited=any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants),
-        refitted=_fitted(found),
-        fates=[(f.name, verdicts[f.verdict], f.how, shares[f.name]) for f in compared.fates],
-        errors_title=errors_title(found).capitalize(),
-        channels=[f"{channels.find_channel(n).label} [%]" for n in compared.errors[NATIVE]],
-        errors=[(label, [f"{x:.3g}" for x in percent.values()]) for label, percent in compared.errors.items()],
-        seen=[escape_markdown(line) for line in conditions_seen(found)],
-        untested=not_tested(found),
+        constants=[(c, escape_markdown(c.name), escape_markdown(c.source)) for c in export.constants],
+        cited=any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in export.constants),
+        refitted=_fitted(export),
+        fates=[(fate.name, verdicts[fate.verdict], fate.how, shares[fate.name]) for fate in comparison.fates],
+        errors_title=errors_title(export).capitalize(),
+        channels=[f"{channels.find_channel(n).label} [%]" for n in comparison.errors[NATIVE]],
+        errors=[(label, [f"{x:.3g}" for x in percent.values()]) for label, percent in comparison.errors.items()],
+        seen=[escape_markdown(line) for line in conditions_seen(export)],
+        untested=not_tested(export),
     )

@@ -20,7 +20,7 @@ from sweeps.report.document import Cell, Column, Figure, Section, Table, remarks
 from sweeps.report.run_tables import condition_columns, reading_form
 
 #: Fewest rows of a log for a frequency response.
-FREQUENCIES = 64
+FEWEST_ROWS = 64
 #: Names of the fits in tables of rms errors.
 FITS = {
     "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
@@ -54,22 +54,23 @@ def error_cell(percent: float) -> Cell:
     return Cell(percent, "" if not np.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad")
 
 
-def noise_sentence(noise: Mapping[str, tuple[float | None, str]], shown: Iterable[Channel]) -> str:
+def noise_sentence(noise: Mapping[str, tuple[float | None, str]], channels: Iterable[Channel]) -> str:
     """Standard deviation of each channel with its source, as the median share of the reading [%]."""
-    of_channels = ((c.label, *noise[c.name]) for c in shown if c.name in noise)
+    noise_of_channels = ((c.label, *noise[c.name]) for c in channels if c.name in noise)
     parts = (
-        f"{label} {'' if share is None else f'{share:.2f} % '}({source})" for label, share, source in of_channels
+        f"{label} {'' if share is None else f'{share:.2f} % '}({source})"
+        for label, share, source in noise_of_channels
     )
     return f"Noise (sd): {'; '.join(parts)}."
 
 
-def rms_table(rms: Mapping[str, Mapping[str, float]], shown: Sequence[Channel]) -> Table:
+def rms_table(rms: Mapping[str, Mapping[str, float]], channels: Sequence[Channel]) -> Table:
     """rms errors in the units of their channels, by fit."""
-    rows = [(FITS[fit], *(rms_by_channel.get(c.name) for c in shown)) for fit, rms_by_channel in rms.items()]
-    return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .4g" for c in shown))
+    rows = [(FITS[fit], *(rms_by_channel.get(c.name) for c in channels)) for fit, rms_by_channel in rms.items()]
+    return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .4g" for c in channels))
 
 
-def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, str]) -> Table:
+def fits_of_runs(table: Columns, channels: Sequence[Channel], lines: Mapping[str, str]) -> Table:
     """Fit of each run, 100 (1 - |y - ŷ| / |y - mean y|) [%]: 100 is exact, 0 is as good as the mean.
 
     Args:
@@ -78,28 +79,28 @@ def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, s
     runs = np.asarray(table.get("run_id", np.full(len(table["time_s"]), "log")))
     fits = [
         (
-            str(name), words,
+            str(name), line_name,
             *(
                 100 - 100 * np.sqrt(1 - r_squared(table[c.column][rows], table[prefix + c.column][rows]))
-                for c in shown
+                for c in channels
             ),
         )
         for name in dict.fromkeys(runs.tolist())
         for rows in (runs == name,)
-        for prefix, words in lines.items()
+        for prefix, line_name in lines.items()
     ]  # fmt: skip
-    return catalogue.table("fit.runs", fits, *(f"{c.label} | .1f" for c in shown))
+    return catalogue.table("fit.runs", fits, *(f"{c.label} | .1f" for c in channels))
 
 
-def frequency_response(runs: Runs, shown: Sequence[Channel], lines: Mapping[str, str]) -> list[Figure]:
+def frequency_response(runs: Runs, channels: Sequence[Channel], lines: Mapping[str, str]) -> list[Figure]:
     """Figure of the response of each channel to the drive. None for a short log or a constant drive.
 
     Args:
         runs: runs with measured and simulated columns.
         lines: prefixes of simulated columns and their names.
     """
-    swept = len(runs) >= FREQUENCIES and np.ptp(applied_drive(runs)) > 0
-    return [catalogue.figure("fit.frequency", runs, shown, lines)] * bool(swept)
+    has_response = len(runs) >= FEWEST_ROWS and np.ptp(applied_drive(runs)) > 0
+    return [catalogue.figure("fit.frequency", runs, channels, lines)] * bool(has_response)
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:
@@ -112,9 +113,9 @@ def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]
 
 def rows_section(
     table: Columns,
-    shown: Sequence[Channel],
+    channels: Sequence[Channel],
     kinds: Mapping[str, str],
-    sized: bool,
+    in_units: bool,
     *,
     mass: bool = False,
     first: Mapping[str, Any] = MappingProxyType({}),
@@ -125,26 +126,28 @@ def rows_section(
 
     Args:
         kinds: description of each kind of readings, by the prefix of its columns.
-        sized: True if errors are in the channel's unit instead of percent.
+        in_units: True if errors are in the channel's unit instead of percent.
         mass: True to include the total mass.
         first, last: further cells, by the heading of their column.
         fields: further fields of the table.
     """
-    cells = [(Column(word), values) for word, values in ({**first, "configuration": table["configuration"]}).items()]
+    cells = [
+        (Column(heading), values) for heading, values in ({**first, "configuration": table["configuration"]}).items()
+    ]
     cells += [(column, table[name]) for name, column in condition_columns(table, mass=mass).items()]
     *_, simulated = kinds
-    for c in shown:
+    for c in channels:
         reading = Column("", c.unit, reading_form(c), c.label, terminal=False)
         cells += [
             (dataclasses.replace(reading, heading=heading), table[prefix + c.column])
             for prefix, heading in kinds.items()
         ]
-        if sized:
+        if in_units:
             errors = table[simulated + c.column] - table[c.column]
             cells.append((Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label), errors))
         elif f"error_{c.name}_percent" in table:
-            shares = [error_cell(float(e)) for e in table[f"error_{c.name}_percent"]]
-            cells.append((Column("error", "%", "{:+.1f}", c.label), shares))
-    cells += [(Column(word), values) for word, values in last.items()]
+            error_cells = [error_cell(float(e)) for e in table[f"error_{c.name}_percent"]]
+            cells.append((Column("error", "%", "{:+.1f}", c.label), error_cells))
+    cells += [(Column(heading), values) for heading, values in last.items()]
     heads, values = zip(*cells, strict=True)
     return Section("Rows", (catalogue.table("fit.rowtable", list(zip(*values, strict=True)), *heads, **fields),))

@@ -79,20 +79,20 @@ class FigureAlbum:
             draw: function that returns the figure, or an overlay over time.
         """
         with figure_settings():
-            drawn = draw()
-            figure = drawn.draw() if isinstance(drawn, TimeOverlay) else drawn
-            text = figure_as_svg(figure)
-        write_text(self.folder / f"{name}.svg", printable(text))
+            drawing = draw()
+            figure = drawing.draw() if isinstance(drawing, TimeOverlay) else drawing
+            svg = figure_as_svg(figure)
+        write_text(self.folder / f"{name}.svg", printable(svg))
         # An SVG document as an element of a page, with the class `looks` and unique ids
-        looks = "scale" if has_colour_scale(figure) else ""
-        element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", text[text.index("<svg") :])
-        element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
+        css_class = "scale" if has_colour_scale(figure) else ""
+        element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
+        element = element.replace("<svg ", f'<svg class="{css_class}" ', 1)
         used_ids = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
         element = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used_ids else "", element)
         self.pictures[name] = Markup(re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element))
-        if isinstance(drawn, TimeOverlay):
+        if isinstance(drawing, TimeOverlay):
             self.overlays = True
-            data = f'<script type="application/json" data-overlay="{name}">{drawn.to_json()}</script>'
+            data = f'<script type="application/json" data-overlay="{name}">{drawing.to_json()}</script>'
             self.pictures[name] += Markup(data)
 
 
@@ -106,9 +106,12 @@ def _parameter_section(file: RobotFile) -> Section:
     """Parameters of a rig, or those in which a robot differs from the nominal one."""
     from mmrjax.model.paper_robots import ROBOTS
 
-    name, values, rows = "own", ["value | .6g"], capabilities.rig_parameters(file)
+    name = "own"
+    values = ["value | .6g"]
+    rows = capabilities.rig_parameters(file)
     if file.robot.rig.inherits:
-        name, values = "changed", ["this robot | .6g", "nominal | .6g"]
+        name = "changed"
+        values = ["this robot | .6g", "nominal | .6g"]
         rows = capabilities.changed_parameters(file.robot, ROBOTS["nominal"]())
     heads = columns("parameter", *values, "unit", "meaning")
     table = Table(name, heads, [(f"`{parameter}`", *rest) for parameter, *rest in rows])
@@ -118,9 +121,9 @@ def _parameter_section(file: RobotFile) -> Section:
 def _files_of_folder(folder: Path) -> dict[str, str]:
     """Files of a run folder, including those still to be written, with their descriptions. Known files come first."""
     files = {p.name + "/" * p.is_dir() for p in folder.iterdir()} | {"manifest.json"}
-    known = {name: meaning for name, meaning in words.FILES.items() if name in files}
-    others = sorted(name for name in files - known.keys() if "." in name and name != "report.html")
-    return known | dict.fromkeys(others, "")  # no locks, no chunks
+    described = {name: meaning for name, meaning in words.FILES.items() if name in files}
+    others = sorted(name for name in files - described.keys() if "." in name and name != "report.html")
+    return described | dict.fromkeys(others, "")  # no locks, no chunks
 
 
 def marked_html(text: str) -> Markup:

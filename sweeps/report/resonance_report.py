@@ -29,11 +29,11 @@ from mmrjax.undercarriage.ripple_peaks import (
 from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Cell, Document, Section, remarks
 
-SAID = 3  # most ranges to avoid in a sentence
+RANGES_IN_SENTENCE = 3  # most ranges to avoid in a sentence
 
 
 #: Status of a run that is too slow for its ripple to be evaluated.
-SLOW = "too_slow"
+TOO_SLOW = "too_slow"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,29 +65,29 @@ class ResonanceResult:
         return group_resonances(self.peaks)
 
     @property
-    def strong(self) -> list[RipplePeak]:
+    def strong_peaks(self) -> list[RipplePeak]:
         """Peaks of the strongest resonances."""
         kinds = {(r.mode, r.order, r.signal) for r in strongest_resonances(self.resonances)}
         return [p for p in self.peaks if (p.mode, p.order, p.signal) in kinds]
 
     @property
-    def read(self) -> np.ndarray:
+    def is_evaluated(self) -> np.ndarray:
         """True for rows whose ripple is evaluated."""
         return np.isfinite(self.table["reaction_ripple_percent"])
 
     @property
     def speeds(self) -> tuple[float, float]:
         """Smallest and largest evaluated speed [m/s], NaN without one."""
-        speed = self.table["speed_mean_mm_s"][self.read] * MM
+        speed = self.table["speed_mean_mm_s"][self.is_evaluated] * MM
         return (float(speed.min()), float(speed.max())) if len(speed) else (float("nan"), float("nan"))
 
     @property
     def statuses(self) -> dict[str, int]:
         """Number of runs with each status, zeros included."""
-        return {s: int(np.sum(self.table["status"] == s)) for s in (*STATUSES, SLOW)}
+        return {s: int(np.sum(self.table["status"] == s)) for s in (*STATUSES, TOO_SLOW)}
 
     @property
-    def avoid(self) -> list[tuple[float, float, list[Resonance]]]:
+    def ranges_to_avoid(self) -> list[tuple[float, float, list[Resonance]]]:
         """Ranges of speed to avoid [m/s], lowest first, each for one mode and order, with its resonances."""
         by_mode: dict[tuple[str, int], list[Resonance]] = {}
         for r in strongest_resonances(self.resonances):
@@ -96,35 +96,36 @@ class ResonanceResult:
         return sorted(ranges, key=lambda x: x[0])
 
     @property
-    def restless(self) -> list[tuple[float, float]]:
+    def unsettled_ranges(self) -> list[tuple[float, float]]:
         """Ranges of speed in which a run did not settle [m/s], each up to half way to the neighbouring runs."""
-        ranges, speed = [], self.travel * MM
+        ranges = []
+        speed = self.run_speeds * MM
         for payload in self.modes:
             rows = np.flatnonzero((self.table["payload_kg"] == payload) & np.isfinite(speed))
             rows = rows[np.argsort(speed[rows])]
             x = speed[rows]
             edges = np.concatenate([x[:1], (x[1:] + x[:-1]) / 2, x[-1:]])
-            bad = self.table["status"][rows] != "converged"
-            ranges += [(edges[k], edges[k + 1]) for k in np.flatnonzero(bad)]
+            is_unsettled = self.table["status"][rows] != "converged"
+            ranges += [(edges[k], edges[k + 1]) for k in np.flatnonzero(is_unsettled)]
         return _merge_ranges(ranges)
 
     @property
-    def travel(self) -> np.ndarray:
+    def run_speeds(self) -> np.ndarray:
         """Speed of every run [mm/s]. Missing ones follow from the voltage by a line through the others, NaN if there
         are too few.
         """
         speed, voltage = self.table["speed_mean_mm_s"], self.table["supply_voltage_V"]
-        if self.read.sum() < 2:
+        if self.is_evaluated.sum() < 2:
             return speed
-        line = np.polyfit(voltage[self.read], speed[self.read], 1)
-        return np.where(self.read, speed, np.polyval(line, voltage))
+        line = np.polyfit(voltage[self.is_evaluated], speed[self.is_evaluated], 1)
+        return np.where(self.is_evaluated, speed, np.polyval(line, voltage))
 
     @property
-    def quiet(self) -> list[tuple[float, float]]:
+    def quiet_ranges(self) -> list[tuple[float, float]]:
         """Ranges of speed [m/s] without peaks to avoid at any payload, in which every run settles."""
         low, high = self.speeds
         gaps = []
-        for begin, end in _merge_ranges([*((a, b) for a, b, _ in self.avoid), *self.restless]):
+        for begin, end in _merge_ranges([*((a, b) for a, b, _ in self.ranges_to_avoid), *self.unsettled_ranges]):
             if begin > low:
                 gaps.append((low, min(begin, high)))
             low = max(low, end)
@@ -140,45 +141,54 @@ class ResonanceResult:
         low, high = self.speeds
         if not np.isfinite(low):
             return [f"No run of {self.configuration} travels (see status)."]
-        parts, avoid, restless, what = [], self.avoid, self.restless, self.passing.name
-        of_modes, bare = ([r for r in avoid if bool(r[2][0].mode) is has] for has in (True, False))
-        if of_modes:
-            loads = "" if len(self.modes) == 1 else "at least at one payload: "
-            parts.append(f"Avoid {loads}{_ranges_in_words(of_modes, what)}.")
-        elif not bare:
+        sentences = []
+        ranges_to_avoid = self.ranges_to_avoid
+        unsettled_ranges = self.unsettled_ranges
+        excitation = self.passing.name
+        with_mode, without_mode = (
+            [r for r in ranges_to_avoid if bool(r[2][0].mode) is expects_mode] for expects_mode in (True, False)
+        )
+        if with_mode:
+            payload_phrase = "" if len(self.modes) == 1 else "at least at one payload: "
+            sentences.append(f"Avoid {payload_phrase}{_ranges_in_words(with_mode, excitation)}.")
+        elif not without_mode:
             largest = ", ".join(
                 f"{s.label} {ripple_percent(float(np.nanmax(self.table[f'{n}_ripple_percent'])))}"
                 for n, s in SIGNALS.items()
             )
-            parts.append(
+            sentences.append(
                 f"No speed to avoid between {span_text(low, high)} mm/s: no ripple peak is at a natural "
                 f"frequency (largest ripple: {largest})."
             )
-        if bare:
-            also = "Ripple also peaks" if of_modes else "Ripple peaks"
-            parts.append(f"{also}, without a natural frequency nearby, at {_ranges_in_words(bare, what)}.")
-        # modes that amplify, but whose frequency varies by an octave over the position of the belt
+        if without_mode:
+            verb_phrase = "Ripple also peaks" if with_mode else "Ripple peaks"
+            sentences.append(
+                f"{verb_phrase}, without a natural frequency nearby, at {_ranges_in_words(without_mode, excitation)}."
+            )
+        # modes that amplify, but vary by an octave in frequency with the position of the belt
         varying = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
         for name in dict.fromkeys(m.name for m in varying):
-            same = [m for m in varying if m.name == name]
-            least, most = min(m.low for m in same), max(m.high for m in same)
-            parts.append(
-                f"{name.capitalize()} has no single frequency: {span_text(least, most, 1)} Hz, depending on the "
+            modes_of_name = [m for m in varying if m.name == name]
+            lowest, highest = min(m.low for m in modes_of_name), max(m.high for m in modes_of_name)
+            sentences.append(
+                f"{name.capitalize()} has no single frequency: {span_text(lowest, highest, 1)} Hz, depending on the "
                 "belt's position."
             )
-        if restless:
-            parts.append(f"Not every run settles at {', '.join(span_text(*x) for x in restless)} mm/s.")
-        if avoid or restless:
-            free = ", ".join(span_text(*x) for x in self.quiet)
-            parts.append(
-                f"Speeds without these problems: {free} mm/s." if free else "No speed is without these problems."
+        if unsettled_ranges:
+            sentences.append(f"Not every run settles at {', '.join(span_text(*x) for x in unsettled_ranges)} mm/s.")
+        if ranges_to_avoid or unsettled_ranges:
+            quiet_text = ", ".join(span_text(*x) for x in self.quiet_ranges)
+            sentences.append(
+                f"Speeds without these problems: {quiet_text} mm/s."
+                if quiet_text
+                else "No speed is without these problems."
             )
-        if what == "teeth":
-            parts.append(
+        if excitation == "teeth":
+            sentences.append(
                 "Without grousers on the ground, the belt's teeth cause the ripple, one every "
                 f"{self.passing.travel / MM:.2f} mm of travel."
             )
-        return parts
+        return sentences
 
     def to_json(self) -> Json:
         """`result.json`."""
@@ -203,10 +213,10 @@ class ResonanceResult:
             "avoid": [
                 {"low_m_s": low, "high_m_s": high, "mode": members[0].mode, "order": members[0].order,
                  "ripple": {r.signal: r.ripple for r in members}, "rise": {r.signal: r.rise for r in members}}
-                for low, high, members in self.avoid
+                for low, high, members in self.ranges_to_avoid
             ],
-            "quiet_m_s": self.quiet,
-            "restless_m_s": self.restless,
+            "quiet_m_s": self.quiet_ranges,
+            "restless_m_s": self.unsettled_ranges,
         }  # fmt: skip
 
 
@@ -226,17 +236,17 @@ def ripple_percent(value: float) -> str:
     return "under 0.01 %" if value < 0.01 else f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
 
 
-def _ranges_in_words(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> str:
+def _ranges_in_words(ranges: list[tuple[float, float, list[Resonance]]], excitation: str) -> str:
     """Ranges to avoid, the lowest speed first. Only the strongest if there are many."""
-    most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
+    strongest = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:RANGES_IN_SENTENCE]
     texts = []
-    for low, high, members in sorted(most, key=lambda r: r[0]):
+    for low, high, members in sorted(strongest, key=lambda r: r[0]):
         mode, order = members[0].mode, members[0].order
         hertz = span_text(min(r.frequencies[0] for r in members), max(r.frequencies[1] for r in members), 1) + " Hz"
-        meets = f"{mode} at {hertz} meets " * bool(mode) + (f"{order} × {what}" if order else hertz)
-        how = ", ".join(f"{SIGNALS[r.signal].label} {ripple_percent(100 * r.ripple)}" for r in members)
-        texts.append(f"{span_text(low, high)} mm/s ({meets}, ripple up to: {how})")
-    more = len(ranges) - len(most)
+        cause = f"{mode} at {hertz} meets " * bool(mode) + (f"{order} × {excitation}" if order else hertz)
+        ripple_text = ", ".join(f"{SIGNALS[r.signal].label} {ripple_percent(100 * r.ripple)}" for r in members)
+        texts.append(f"{span_text(low, high)} mm/s ({cause}, ripple up to: {ripple_text})")
+    more = len(ranges) - len(strongest)
     return "; ".join([*texts, *[f"{more} more on the map"] * bool(more)])
 
 
@@ -246,26 +256,30 @@ def span_text(low: float, high: float, unit: float = MM) -> str:
     return ends[0] if ends[0] == ends[1] else f"{ends[0]}-{ends[1]}"
 
 
-_FEW = "travels, but fewer than {} {} passed. Use a longer --duration"
+_TOO_SLOW_MEANING = "travels, but fewer than {} {} passed. Use a longer --duration"
 #: Most peaks that are not folded.
 UNFOLDED = 30
 
 
-def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
+def resonance_document(result: ResonanceResult, file: RobotFile) -> Document:
     """Report of a resonance map."""
-    (first, *others), passing = found.sentences, found.passing
-    lead = f"**{found.configuration}**, slope {found.slope_deg:g}°, {found.surface}; {found.read.size} runs."
+    (first, *others), passing = result.sentences, result.passing
+    lead = (
+        f"**{result.configuration}**, slope {result.slope_deg:g}°, {result.surface}; {result.is_evaluated.size} runs."
+    )
     values = passing.name, 1000 * passing.travel
-    figure = catalogue.figure("resonance.map", found, finding=found.statement(), words=values)
-    endings = run_tables.endings_table(found.statuses, meanings={SLOW: _FEW.format(PERIODS, passing.name)})
-    strong = found.strong
+    figure = catalogue.figure("resonance.map", result, finding=result.statement(), words=values)
+    endings = run_tables.endings_table(
+        result.statuses, meanings={TOO_SLOW: _TOO_SLOW_MEANING.format(PERIODS, passing.name)}
+    )
+    strong_peaks = result.strong_peaks
     peaks = [
         (
-            Cell(SIGNALS[p.signal].label, "bad" if p in strong else ""), p.payload, p.speed / MM,
+            Cell(SIGNALS[p.signal].label, "bad" if p in strong_peaks else ""), p.payload, p.speed / MM,
             f"{p.low / MM:.0f} to {p.high / MM:.0f}", 100 * p.ripple, 100 * p.rise, p.order or "none", p.frequency,
             p.mode or "none",
         )
-        for p in found.peaks
+        for p in result.peaks
     ]  # fmt: skip
     frequencies = [
         (
@@ -278,11 +292,11 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
                 )
             ),
         )
-        for payload, modes in found.modes.items()
+        for payload, modes in result.modes.items()
         for m in modes
     ]  # fmt: skip
-    of_modes = catalogue.note("resonance.modes"), catalogue.table("resonance.frequencies", frequencies)
-    about_peaks = catalogue.note("resonance.peaks", passing.name, 100 * MATTERS)
+    mode_blocks = catalogue.note("resonance.modes"), catalogue.table("resonance.frequencies", frequencies)
+    peaks_note = catalogue.note("resonance.peaks", passing.name, 100 * MATTERS)
     folded = count_noun(len(peaks), "peak") if len(peaks) > UNFOLDED else ""
     return Document(
         "Which speeds to avoid",
@@ -290,11 +304,11 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
         (
             run_tables.note_on_robot(file, "track", lead),
             *remarks(others),
-            figure if found.read.any() else catalogue.note("resonance.still"),
+            figure if result.is_evaluated.any() else catalogue.note("resonance.still"),
         ),
         (
-            Section("Natural frequencies", of_modes, "modes"),
-            Section("Peaks of ripple against speed", (about_peaks,), "peaks"),
+            Section("Natural frequencies", mode_blocks, "modes"),
+            Section("Peaks of ripple against speed", (peaks_note,), "peaks"),
             Section("", (catalogue.table("resonance.peaks_found", peaks),), folded=folded),
             Section("How the runs ended", (catalogue.note("resonance.ended", 100 * TAIL), endings), "ended"),
         ),

@@ -91,16 +91,21 @@ def axis_title(column: str) -> str:
 
 def quantity_cells(table: Columns, name: str) -> list[Any]:
     """Cells of a column, each with its standard deviation if the table has one. Infinite numbers are in words."""
-    values, spread = table[name], table.get(name + run.SD)
-    if spread is not None:
+    values = table[name]
+    sds = table.get(name + run.SD)
+    if sds is not None:
         digits = _REGISTERED[name].resolution
-        return [None if math.isnan(v) else run.with_sd(v, s, digits) for v, s in zip(values, spread, strict=True)]
+        return [
+            None if math.isnan(value) else run.with_sd(value, sd, digits)
+            for value, sd in zip(values, sds, strict=True)
+        ]
     if name == "status":
-        return [Cell(s, "" if s in words.SETTLED else "slides") for s in map(str, values)]
+        return [Cell(sd, "" if sd in words.SETTLED else "slides") for sd in map(str, values)]
     if values.dtype.kind != "f":
-        return [_MISSING.get(name, "") if v == "" else v for v in values]
-    endless, missing = _ENDLESS.get(name, words.NONE_SETTLES), _MISSING.get(name)
-    return [missing if math.isnan(v) else endless if math.isinf(v) else v for v in values]
+        return [_MISSING.get(name, "") if value == "" else value for value in values]
+    infinite_text = _ENDLESS.get(name, words.NONE_SETTLES)
+    missing_text = _MISSING.get(name)
+    return [missing_text if math.isnan(value) else infinite_text if math.isinf(value) else value for value in values]
 
 
 def quantity_table(
@@ -114,8 +119,8 @@ def quantity_table(
         fields: further fields of the table.
     """
     empty = {n for n, x in table.items() if x.dtype.kind == "f" and np.isnan(x).all()} - {"supply_voltage_V"}
-    shown_names = [n for n in dict.fromkeys(names) if n in table and n not in empty]
-    cells = [(quantity_column(n), quantity_cells(table, n)) for n in shown_names]
+    present_names = [n for n in dict.fromkeys(names) if n in table and n not in empty]
+    cells = [(quantity_column(n), quantity_cells(table, n)) for n in present_names]
     return table_from_cells(name, [*first, *cells], **fields)
 
 
@@ -143,7 +148,7 @@ def curve_warning(robot: Robot) -> tuple[Note, ...]:
 
 def endings_table(
     counts: Mapping[str, int],
-    things: str = "runs",
+    noun: str = "runs",
     model: str = "",
     meanings: Mapping[str, str] = MappingProxyType({}),
     **more: Json,
@@ -156,21 +161,26 @@ def endings_table(
         more: further columns, with values by status.
     """
     order = [*words.STATUSES, *counts]
-    total, reached = sum(counts.values()), sorted((s for s, n in counts.items() if n), key=order.index)
-    further = (f"~{name.replace('_', ' ')}" for name in more)
-    heads = columns("ended", f"{things} | ,", "share [%] | .3g", "~status", "meaning", *further)
-    meant = {s: meanings.get(s) or words.VERDICTS.get((model, s)) or words.status_meaning(s) for s in reached}
+    total = sum(counts.values())
+    statuses = sorted((status for status, n in counts.items() if n), key=order.index)
+    further_titles = (f"~{name.replace('_', ' ')}" for name in more)
+    heads = columns("ended", f"{noun} | ,", "share [%] | .3g", "~status", "meaning", *further_titles)
+    meaning_of_status = {
+        status: meanings.get(status) or words.VERDICTS.get((model, status)) or words.status_meaning(status)
+        for status in statuses
+    }
     rows = [
         (
-            Cell(words.short_status(s), "good" if s in words.SETTLED else "bad"), counts[s], 100 * counts[s] / total,
-            f"`{s}`", meant[s], *(m.get(s) for m in more.values()),
+            Cell(words.short_status(status), "good" if status in words.SETTLED else "bad"), counts[status],
+            100 * counts[status] / total, f"`{status}`", meaning_of_status[status],
+            *(values.get(status) for values in more.values()),
         )
-        for s in reached
+        for status in statuses
     ]  # fmt: skip
     return Table("statuses", heads, rows)
 
 
-def limits_table(limits: Sequence[Json], what: str) -> Table:
+def limits_table(limits: Sequence[Json], subject: str) -> Table:
     """Table of the use of each limit: value, limit, and share that is used."""
     rows = []
     for limit in limits:
@@ -179,15 +189,15 @@ def limits_table(limits: Sequence[Json], what: str) -> Table:
             share, "over" if share > 100 else "bar"
         )  # fmt: skip
         rows.append((limit["words"], limit["value"], limit["limit"], used))
-    return catalogue.table("run.limits", rows, f"{what} |")
+    return catalogue.table("run.limits", rows, f"{subject} |")
 
 
-def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[Json]:
+def use_of_limits(limits: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[Json]:
     """Use of each known limit: name, value, limit, and share of the limit [%]. For windings it is the share of the
     permissible temperature rise.
 
     Args:
-        asked: name, value, limit, and format with unit. NaN: unknown.
+        limits: name, value, limit, and format with unit. NaN: unknown.
         ambient: temperature [°C].
     """
     return [
@@ -196,7 +206,7 @@ def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) ->
             "limit": form.format(float(limit)),
             "percent": warming_share(value, limit, ambient) if "°C" in form else 100 * abs(value) / float(limit),
         }
-        for name, value, limit, form in asked
+        for name, value, limit, form in limits
         if not (math.isnan(value) or math.isnan(limit) or limit >= UNLIMITED)
     ]  # fmt: skip
 

@@ -37,7 +37,7 @@ def runs_document(
     model: str,
     runs: Columns,
     histories: RunBatch | None = None,
-    stands: Postures | None = None,
+    postures: Postures | None = None,
     notes: Sequence[str] = (),
 ) -> Document:
     """Report of a few finished runs.
@@ -45,11 +45,13 @@ def runs_document(
     Args:
         runs: table of the finished runs.
         histories: the runs as a batch with histories, if these are kept.
-        stands: postures, if the runs state lever angles.
+        postures: postures, if the runs state lever angles.
         notes: remarks on the runs.
     """
-    robot, names = file.robot, run_headings(runs)
-    single, first_run = len(names) == 1, {key: value[0] for key, value in runs.items()}
+    robot = file.robot
+    names = run_headings(runs)
+    single = len(names) == 1
+    first_run = {key: value[0] for key, value in runs.items()}
     limit_use = limits_used(robot, first_run) if single else []
     table = capabilities.drop_inapplicable_columns(robot, runs)
     if not np.nan_to_num(table.get("voltage_cell_V", 0.0)).any():
@@ -59,9 +61,9 @@ def runs_document(
         blocks += [run_tables.limits_table(limit_use, "this run"), catalogue.note("run.warming")]
     if not (single and first_run["status"] in words.SETTLED):
         blocks.append(run_tables.endings_table(Counter(map(str, runs["status"]))))
-    blocks += remarks([*notes, *([] if stands is None else [turn_words.posture_sentences(stands)])])
+    blocks += remarks([*notes, *([] if postures is None else [turn_words.posture_sentences(postures)])])
     imposed = run_tables.imposed_column(table)
-    shown_table = run_tables.quantity_table(
+    run_table = run_tables.quantity_table(
         "runs", table, (imposed, *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER),
         first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE, sideways=True,
     )  # fmt: skip
@@ -69,32 +71,33 @@ def runs_document(
     def sections() -> Iterable[Section]:
         if histories is not None:
             yield from _histories(robot, runs, names, histories)
-        if stands is not None:
-            yield Section("Posture", (catalogue.figure("runs.posture", stands),), "posture-section")
+        if postures is not None:
+            yield Section("Posture", (catalogue.figure("runs.posture", postures),), "posture-section")
         yield Section("Where the power goes", tuple(_power(robot, runs, names)), "chain")
 
-    of_runs = Section("The run" if single else "The runs", (shown_table,), "runs-section")
+    runs_section = Section("The run" if single else "The runs", (run_table,), "runs-section")
     title = f"Run of {names[0]}" if single else f"{len(names)} runs"
-    return Document(title, runs_answer(runs, robot.channels, limit_use), tuple(blocks), (of_runs,), sections)
+    return Document(title, runs_answer(runs, robot.channels, limit_use), tuple(blocks), (runs_section,), sections)
 
 
-def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]) -> str:
+def runs_answer(runs: Columns, channels: Sequence[Channel], limit_use: Sequence[Json]) -> str:
     """One sentence: readings of a single run and its most used limit, or the number of runs that settle.
 
     Args:
-        used: limits of a single run, from `limits_used`.
+        limit_use: limits of a single run, from `limits_used`.
     """
     settled = np.isin(runs["status"], words.SETTLED)
     if len(settled) > 1:
         flagged = int((settled & (runs["flags"] != "")).sum())
-        within = ", all within every limit" if settled.any() else ""
-        limits_words = f". {flagged} of them {'exceeds' if flagged == 1 else 'exceed'} a limit" if flagged else within
-        return f"{settled.sum()} of {len(settled)} runs have an operating point{limits_words}."
+        limits_text = ", all within every limit" if settled.any() else ""
+        if flagged:
+            limits_text = f". {flagged} of them {'exceeds' if flagged == 1 else 'exceed'} a limit"
+        return f"{settled.sum()} of {len(settled)} runs have an operating point{limits_text}."
     if not settled[0]:
         return f"No operating point: {words.status_meaning(str(runs['status'][0]))}."
     readings = ", ".join(f"{c.label} {run_tables.reading_text(runs[c.column][0], c)} {c.unit}" for c in channels)
     answer = f"{readings[0].upper()}{readings[1:]}."
-    nearest = max((x for x in used if x["percent"] is not None), key=lambda x: x["percent"], default=None)
+    nearest = max((x for x in limit_use if x["percent"] is not None), key=lambda x: x["percent"], default=None)
     if nearest is None:
         return answer
     verb = "exceeds its limit" if nearest["percent"] > 100 else "is the nearest limit"
@@ -108,7 +111,7 @@ def run_headings(runs: Columns) -> list[str]:
 
 
 def conditions_in_words(table: Columns, row: int) -> str:
-    """Conditions of a row in words: the imposed quantity, and for vehicles payload, slope and a rig's surface."""
+    """Conditions of a row in words: configuration, imposed quantity, payload, slope, load torque and duties."""
     run = {name: values[row] for name, values in table.items()}
     parts = [str(run["configuration"])]
     if "supply_voltage_V" in run:
@@ -127,52 +130,64 @@ def conditions_in_words(table: Columns, row: int) -> str:
 
 
 def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatch) -> Iterable[Section]:
-    """Section on runs over time: readings of instruments, or starts on a ground, with effects of the running gear."""
-    history, status = histories.history, np.asarray(histories.result.status)
+    """Sections on runs over time: readings of a shaft, or starts of a vehicle and the ripple of its running gear."""
+    history = histories.history
+    status = np.asarray(histories.result.status)
     assert history is not None  # the fidelity was asked for it
-    shown, cut = names[:HISTORIES], (catalogue.note("runs.cut", HISTORIES, len(names)),) * (len(names) > HISTORIES)
+    shown_names = names[:HISTORIES]
+    cut_notes = (catalogue.note("runs.cut", HISTORIES, len(names)),) * (len(names) > HISTORIES)
     if not robot.has_ground:
         if any(c.over_time for c in robot.channels):
-            figure = catalogue.figure("runs.courses", robot.channels, history, status, shown)
-            yield Section("Over time", (*cut, figure), "history-section")
+            figure = catalogue.figure("runs.courses", robot.channels, history, status, shown_names)
+            yield Section("Over time", (*cut_notes, figure), "history-section")
         return
     from sweeps.pages import history_figures, resonance_figures
 
     configuration_indices = [robot.configurations.index(str(c)) for c in runs["configuration"]]
-    starts = history_figures.start_runs(robot, history, status, configuration_indices, shown)
+    starts = history_figures.start_runs(robot, history, status, configuration_indices, shown_names)
     averaged = ""
     if history.reactions is not None:
         averaged = catalogue.text("runs.averaged", 1e3 * float(history.time[0, 1] - history.time[0, 0]))
     figure = catalogue.figure("runs.history", starts, more=averaged)
-    yield Section("From standstill", (*cut, figure, starts_table(starts)), "history-section")
+    yield Section("From standstill", (*cut_notes, figure, starts_table(starts)), "history-section")
     if history.reactions is None:
         return
     share = np.asarray(histories.columns["guide_share"])
     gears = resonance_figures.gear_runs(robot, history, status, share, configuration_indices, names[:GEARS])
     # Ripple is evaluated in steady travel: contacts stop sliding before the evaluated part.
     ripples = [
-        g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.stages.slipping)
+        gear
+        for gear, start in zip(gears, starts, strict=False)
+        if start.gets_under_way and gear.settled_since(start.stages.slipping)
     ]
     if ripples:
-        on_tracks = [g for g in ripples if g.on_tracks][:1]
-        touchdowns = (catalogue.figure("runs.touchdown", g, f"{g.name}: touchdowns dotted") for g in on_tracks)
+        on_tracks = [gear for gear in ripples if gear.on_tracks][:1]
+        touchdowns = (
+            catalogue.figure("runs.touchdown", gear, f"{gear.name}: touchdowns dotted") for gear in on_tracks
+        )
         figures = (*touchdowns, catalogue.figure("runs.reactions", ripples))
-        ripple = catalogue.figure("runs.ripple", ripples), ripple_table(ripples)
-        yield Section("Inside the running gear", (*ripple, *figures), "gear")
+        ripple_blocks = catalogue.figure("runs.ripple", ripples), ripple_table(ripples)
+        yield Section("Inside the running gear", (*ripple_blocks, *figures), "gear")
 
 
 def starts_table(starts: Sequence[Any]) -> Table:
     """Table of stages, currents and slip of each start. Runs that do not get under way have no stages."""
     rows = []
-    for s in starts:
+    for start in starts:
         numbers: list[float | None] = [None] * 10
-        if s.time.size:
-            stages = s.stages
-            times, slips = [stages.starting, stages.slipping, stages.settled], [*stages.slip, stages.slip_settling]
-            if not s.gets_under_way:
-                times, slips = [None] * 3, [math.nan] * 4
-            numbers = [*times, *(stages.sense * x for x in (s.peak, *s.ended)), *(100 * x for x in slips)]
-        rows.append((s.name, words.short_status(s.status), *numbers))
+        if start.time.size:
+            stages = start.stages
+            times = [stages.starting, stages.slipping, stages.settled]
+            slips = [*stages.slip, stages.slip_settling]
+            if not start.gets_under_way:
+                times = [None] * 3
+                slips = [math.nan] * 4
+            numbers = [
+                *times,
+                *(stages.sense * x for x in (start.peak, *start.end_values)),
+                *(100 * x for x in slips),
+            ]
+        rows.append((start.name, words.short_status(start.status), *numbers))
     return catalogue.table("runs.starts", rows)
 
 
@@ -188,13 +203,15 @@ def _power(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[Block]
     from sweeps.pages import power_figures
 
     settled = np.isin(runs["status"], words.SETTLED)
-    chain = np.flatnonzero(power_figures.drawable_runs(runs) & settled)[:CHAINS]
-    if chain.size:
-        if len(chain) < len(names):
-            yield catalogue.note("runs.chains", len(chain), len(names), CHAINS)
-        picked = {key: value[chain] for key, value in runs.items()}
-        more = catalogue.text("runs.on_ground" if robot.has_ground else "runs.on_shaft")
-        yield catalogue.figure("runs.power", picked, [names[k] for k in chain], robot.has_ground, more=more)
+    chain_rows = np.flatnonzero(power_figures.drawable_runs(runs) & settled)[:CHAINS]
+    if chain_rows.size:
+        if len(chain_rows) < len(names):
+            yield catalogue.note("runs.chains", len(chain_rows), len(names), CHAINS)
+        chain_runs = {key: value[chain_rows] for key, value in runs.items()}
+        explanation = catalogue.text("runs.on_ground" if robot.has_ground else "runs.on_shaft")
+        yield catalogue.figure(
+            "runs.power", chain_runs, [names[k] for k in chain_rows], robot.has_ground, more=explanation
+        )
     else:
         sentence = "no run ends in steady travel" if robot.has_ground else "no run ends turning steadily"
         unknown = [] if robot.knows(VOLTAGE) else capabilities.unknown_numbers_sentence(robot)
@@ -209,32 +226,39 @@ def _power(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[Block]
 
 def limits_used(robot: Robot, run: Json) -> list[Json]:
     """Use of each limit by a run. The inrush current has no share if its limit is not stated."""
-    idle = capabilities.inapplicable_columns(robot)
-    point = drive_curves.operating_points(robot, {name: np.atleast_1d(x) for name, x in run.items()})
-    shaft, torque = float(point["motor_rpm"][0]), float(point["torque_Nm"][0])
-    cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: no supply
-    gear = f"gearbox torque at {'the driving wheel' if robot.has_ground else 'its output'}"
+    inapplicable = capabilities.inapplicable_columns(robot)
+    points = drive_curves.operating_points(robot, {name: np.atleast_1d(x) for name, x in run.items()})
+    motor_speed, torque = float(points["motor_rpm"][0]), float(points["torque_Nm"][0])
+    cell = math.nan if "voltage_cell_V" in inapplicable else float(run["voltage_cell_V"]) or math.nan  # 0: no supply
+    torque_label = f"gearbox torque at {'the driving wheel' if robot.has_ground else 'its output'}"
     limits = [
-        ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}"),
-        ("motor speed", shaft, float(robot.motor.speed_limit) / RPM, "{:.0f} rpm"),
-        ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / RPM, "{:.0f} rpm"),
+        ("adhesion", math.nan if "adhesion_used" in inapplicable else float(run["adhesion_used"]), 1.0, "{:.2f}"),
+        ("motor speed", motor_speed, float(robot.motor.speed_limit) / RPM, "{:.0f} rpm"),
+        ("gearbox input speed", motor_speed, float(robot.gearbox.speed_limit) / RPM, "{:.0f} rpm"),
         ("winding, long running", run["winding_settled_C"], robot.motor.temperature_limit, "{:.0f} °C"),
-        (gear, torque if abs(shaft) > 1e-9 else math.nan, robot.gearbox.torque_limit or math.nan, "{:.2f} N·m"),
+        (
+            torque_label,
+            torque if abs(motor_speed) > 1e-9 else math.nan,
+            robot.gearbox.torque_limit or math.nan,
+            "{:.2f} N·m",
+        ),
         ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f} V"),
     ]
     used_limits = run_tables.use_of_limits(limits, float(robot.motor.temperature_ambient))
     if PEAK in run and not math.isnan(peak := float(run[PEAK])):
         # Largest current for all motors [A]: that of the driver, or of the battery minus other consumers.
-        driver_limit, battery, largest = float(robot.driver.current_limit), robot.battery, list[float]()
+        driver_limit = float(robot.driver.current_limit)
+        battery = robot.battery
+        current_limits = list[float]()
         if driver_limit < float(type(robot.driver)().current_limit):
-            largest.append(float(robot.sides) * driver_limit)
+            current_limits.append(float(robot.sides) * driver_limit)
         if math.isnan(float(run.get("supply_voltage_V", math.nan))) and battery.current_limit is not None:
-            largest.append(battery.current_limit - float(battery.current_other))
-        inrush = min(largest, default=None)
+            current_limits.append(battery.current_limit - float(battery.current_other))
+        current_limit = min(current_limits, default=None)
         used_limits.append({
             "words": "largest current of the start, all motors", "value": f"{peak:.1f} A",
-            "limit": "not stated" if inrush is None else f"{inrush:.1f} A",
-            "percent": None if inrush is None else 100 * peak / inrush,
+            "limit": "not stated" if current_limit is None else f"{current_limit:.1f} A",
+            "percent": None if current_limit is None else 100 * peak / current_limit,
             "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
         })  # fmt: skip
     return used_limits
@@ -254,7 +278,7 @@ def turn_document(
     file: RobotFile,
     model: str,
     run: Columns,
-    ended: Mapping[str, float] | None,
+    end: Mapping[str, float] | None,
     history: History | None,
     turns: Columns | None,
     notes: Sequence[str],
@@ -263,13 +287,15 @@ def turn_document(
 
     Args:
         run: row of the turn in `runs.csv`.
-        ended: time, distance and angle at the end of a run over time.
+        end: time, distance and angle at the end of a run over time.
         history: history over time, if the fidelity keeps it.
         turns: settled turns at other duties of the slower side.
         notes: further remarks.
     """
-    robot, row = file.robot, {name: values[0] for name, values in run.items()}
-    sides, sections = sides_table(robot, row), []
+    robot = file.robot
+    row = {name: values[0] for name, values in run.items()}
+    sides = sides_table(robot, row)
+    sections = []
     if history is not None:
         reading = {name: np.asarray(values)[0] for name, values in history.reading.items()}
         if sides.rows:
@@ -277,27 +303,28 @@ def turn_document(
                 "turn.path", robot, row, *(reading[name] for name in ("place_x", "place_y", "yaw"))
             )
             sections.append(Section("From above", (path,)))
-        names = [f"motor_{what}_{side}" for what in ("current", "speed") for side in SIDES]
+        names = [f"motor_{quantity}_{side}" for quantity in ("current", "speed") for side in SIDES]
         rows = {c.column: reading[c.name] / c.factor for c in channels_named((*names, "yaw_rate"))}
         rows["time_s"] = np.asarray(history.time)[0]
         sections.append(Section("Over time", (catalogue.figure("turn.course", rows),)))
     elif turns is not None:
         sections.append(Section("Other turns", (catalogue.figure("turn.turns", turns, row),)))
-    of_turn = turn_words.turn_notes(robot, row) if turn_words.has_motion(row) else []
+    turn_remarks = turn_words.turn_notes(robot, row) if turn_words.has_motion(row) else []
     return Document(
         f"Turn of {run_headings(run)[0]}",
-        turn_words.turn_answer(row, ended),
-        (run_tables.note_on_robot(file, model), sides, *remarks([*of_turn, *notes])),
+        turn_words.turn_answer(row, end),
+        (run_tables.note_on_robot(file, model), sides, *remarks([*turn_remarks, *notes])),
         tuple(sections),
     )
 
 
 def sides_table(robot: Robot, row: Columns) -> Table:
     """Table of both sides, without rows if no motion is known."""
-    idle, yaw_known = capabilities.inapplicable_columns(robot), math.isfinite(float(row["yaw_rate_rad_s"]))
+    inapplicable = capabilities.inapplicable_columns(robot)
+    has_yaw_rate = math.isfinite(float(row["yaw_rate_rad_s"]))
     rows = []
-    for label, column, form in _ROWS if yaw_known else ():
+    for label, column, form in _ROWS if has_yaw_rate else ():
         values = [float(row[column.format(side)]) for side in SIDES]
-        if column.format(SIDES[0]) not in idle:
+        if column.format(SIDES[0]) not in inapplicable:
             rows.append((label, *(words.NONE_SETTLES if math.isinf(v) else format(v, form) for v in values)))
     return catalogue.table("turn.sides", rows)

@@ -16,74 +16,90 @@ from sweeps.report.document import Document, Section, Table, remarks
 #: Most pairs in a table of interactions, and most outputs that are not folded.
 PAIRS, UNFOLDED = 5, 3
 #: Measure of the shares of the overview, by method.
-_OF = {"local": " to first order", "morris": ", by squared effects"}
+_SHARE_MEASURES = {"local": " to first order", "morris": ", by squared effects"}
 
 
-def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
+def sensitivity_document(result: SensitivityResult, file: RobotFile) -> Document:
     """Report of a finished study."""
-    method = f"Method: {sensitivity_words.METHODS[found.method]} (`{found.method}`)"
-    ran = f", {found.evaluations:,} model evaluations in {found.seconds:.1f} s." if found.evaluations else "."
-    p = found.points.at(np.any([o.studied for o in found.outputs.values()], axis=0))
-    parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
-    _, own_values, symbol = p.imposed
-    for _, x, unit in (("", own_values, f" {symbol}"), *p.ground):
+    method = f"Method: {sensitivity_words.METHODS[result.method]} (`{result.method}`)"
+    effort = f", {result.evaluations:,} model evaluations in {result.seconds:.1f} s." if result.evaluations else "."
+    points = result.points.at(np.any([o.studied for o in result.outputs.values()], axis=0))
+    parts = [", ".join(dict.fromkeys(map(str, points.configuration)))]
+    _, imposed_values, imposed_unit = points.imposed
+    for _, x, unit in (("", imposed_values, f" {imposed_unit}"), *points.ground):
         on_battery = unit == " V" and np.isnan(x).all()
         parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
     overview = catalogue.figure(
-        "sensitivity.overview", found, words=(_OF.get(found.method, ""), "; ".join(parts), 100 * NEGLIGIBLE),
-        more=catalogue.text("sensitivity.sobol") if found.method == "sobol" else "",
+        "sensitivity.overview", result,
+        words=(_SHARE_MEASURES.get(result.method, ""), "; ".join(parts), 100 * NEGLIGIBLE),
+        more=catalogue.text("sensitivity.sobol") if result.method == "sobol" else "",
     )  # fmt: skip
-    idle = [f"less than {100 * NEGLIGIBLE:g} % everywhere: {', '.join(found.negligible)}"] * bool(found.negligible)
-    rows = [_row(study, found) for study in found.outputs.values()]
+    negligible_remark = [f"less than {100 * NEGLIGIBLE:g} % everywhere: {', '.join(result.negligible)}"] * bool(
+        result.negligible
+    )
+    rows = [_row(study, result) for study in result.outputs.values()]
     return Document(
         "Which parameters matter",
-        found.statement(),
+        result.statement(),
         (
-            run_tables.note_on_robot(file, found.model, method + ran),
+            run_tables.note_on_robot(file, result.model, method + effort),
             catalogue.table("sensitivity.leading", rows),
             overview,
-            *remarks([*idle, *found.notes]),
+            *remarks([*negligible_remark, *result.notes]),
         ),
-        page_sections=lambda: _sections(found),
+        page_sections=lambda: _sections(result),
     )
 
 
-def _row(study: OutputStudy, found: SensitivityResult) -> tuple[str | None, ...]:
+def _row(study: OutputStudy, result: SensitivityResult) -> tuple[str | None, ...]:
     """The most important inputs for an output, and its range and spread over the operating points."""
     share, row = study.overall_share, study.row
     order = [k for k in np.argsort(-share, kind="stable")[:3] if share[k] >= NEGLIGIBLE]
-    leading = [f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in order]
+    leading = [f"{short_name(result.names[k])} {100 * share[k]:.0f} %" for k in order]
     value, sd = study.value / row.factor, study.sd / row.factor
     finite = np.isfinite(value) & np.isfinite(sd)
-    numbers: list[str | None] = [None] * 3
+    texts: list[str | None] = [None] * 3
     if finite.any():
         low, high, spread = value[finite].min(), value[finite].max(), np.median(sd[finite])
-        numbers = [f"{x:.{row.resolution}f}" for x in (low, high, spread)]
-    return row.label, *leading, *[""] * (3 - len(leading)), *numbers, row.unit_shown.replace("-", "")
+        texts = [f"{x:.{row.resolution}f}" for x in (low, high, spread)]
+    return row.label, *leading, *[""] * (3 - len(leading)), *texts, row.unit_shown.replace("-", "")
 
 
-def _sections(found: SensitivityResult) -> Iterable[Section]:
+def _sections(result: SensitivityResult) -> Iterable[Section]:
     yield Section("Output by output", (catalogue.note("sensitivity.legend"),), "outputs")
-    for k, (name, study) in enumerate(found.outputs.items()):
-        label, acts = study.row.label.capitalize(), bool(study.overall_share.max(initial=0.0) > 0)
-        acts = acts and bool(study.studied.any()) and bool(np.isfinite(study.value).any())
-        yield Section(label, () if acts else (catalogue.note("sensitivity.nothing"),), name, level=3)
-        if acts:
+    for k, (name, study) in enumerate(result.outputs.items()):
+        label = study.row.label.capitalize()
+        has_influence = bool(study.overall_share.max(initial=0.0) > 0)
+        has_influence = has_influence and bool(study.studied.any()) and bool(np.isfinite(study.value).any())
+        yield Section(label, () if has_influence else (catalogue.note("sensitivity.nothing"),), name, level=3)
+        if has_influence:
             finding = f"{study.row.label} with one input at the ends of its interval"
             tornado = catalogue.figure(
-                "sensitivity.tornado", study, found, finding=finding, words=(label,), suffix=name
+                "sensitivity.tornado", study, result, finding=finding, words=(label,), suffix=name
             )
             yield Section("", (tornado,), folded="tornado" if k >= UNFOLDED else "")
-    yield Section("Inputs", (_inputs(found), catalogue.note("sensitivity.largest")), "inputs")
+    yield Section("Inputs", (_inputs(result), catalogue.note("sensitivity.largest")), "inputs")
 
 
-def _inputs(found: SensitivityResult) -> Table:
+def _inputs(result: SensitivityResult) -> Table:
     """Table of all inputs with their distributions, the most important first."""
-    importance, rows = found.importance(), []
+    importance = result.importance()
+    rows = []
     for k in np.argsort(-importance, kind="stable"):
-        name = found.names[k]
-        x, share = found.inputs[name], importance[k]
-        largest = f"{100 * share:.0f} %" if share >= NEGLIGIBLE else f"< {100 * NEGLIGIBLE:g} %"
-        interval = "{:.3g} to {:.3g}".format(*x.interval)
-        rows.append((f"`{name}`", x.meaning, x.unit, x.distribution, x.median, interval, largest))
+        name = result.names[k]
+        quantity = result.inputs[name]
+        share = importance[k]
+        share_text = f"{100 * share:.0f} %" if share >= NEGLIGIBLE else f"< {100 * NEGLIGIBLE:g} %"
+        interval = "{:.3g} to {:.3g}".format(*quantity.interval)
+        rows.append(
+            (
+                f"`{name}`",
+                quantity.meaning,
+                quantity.unit,
+                quantity.distribution,
+                quantity.median,
+                interval,
+                share_text,
+            )
+        )
     return catalogue.table("sensitivity.inputs", rows)

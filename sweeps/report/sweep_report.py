@@ -37,27 +37,31 @@ class VariedQuantity(NamedTuple):
 
 def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[str] = ()) -> Document:
     """Report of a finished sweep."""
-    shown_runs = capabilities.drop_inapplicable_columns(file.robot, runs)
-    statuses, is_flagged = Counter(map(str, runs["status"])), runs["flags"] != ""
-    flagged_by_status = {s: int(((runs["status"] == s) & is_flagged).sum()) for s in statuses}
-    ranges_by_status = {s: "" if s in words.SETTLED else _ranges_of_runs(runs, runs["status"] == s) for s in statuses}
+    applicable_runs = capabilities.drop_inapplicable_columns(file.robot, runs)
+    statuses = Counter(map(str, runs["status"]))
+    is_flagged = runs["flags"] != ""
+    flagged_by_status = {status: int(((runs["status"] == status) & is_flagged).sum()) for status in statuses}
+    ranges_by_status = {
+        status: "" if status in words.SETTLED else _ranges_of_runs(runs, runs["status"] == status)
+        for status in statuses
+    }
     maps = [
         catalogue.figure(
             "sweep.sweep",
             runs,
-            c,
-            finding=f"{c.label} over the grid",
-            words=(c.label.capitalize(), c.unit),
-            suffix=c.name,
+            channel,
+            finding=f"{channel.label} over the grid",
+            words=(channel.label.capitalize(), channel.unit),
+            suffix=channel.name,
         )
-        for c in file.robot.channels
+        for channel in file.robot.channels
     ]
-    axes = "; ".join(_levels(runs, c) for c in _axes(runs))
-    extremes = (*(c.column for c in file.robot.channels), "slip", "winding_settled_C")
-    kinds, flag_index = np.unique(runs["flags"], return_inverse=True)
+    axes = "; ".join(_levels(runs, name) for name in _axes(runs))
+    extreme_columns = (*(channel.column for channel in file.robot.channels), "slip", "winding_settled_C")
+    flag_sets, flag_index = np.unique(runs["flags"], return_inverse=True)
     rows = []
     for flag, meaning in words.FLAGS.items():
-        is_raised = np.array([flag in str(f).split(";") for f in kinds])[flag_index]
+        is_raised = np.array([flag in str(f).split(";") for f in flag_sets])[flag_index]
         if is_raised.any():
             rows.append((f"{meaning} (`{flag}`)", int(is_raised.sum()), _ranges_of_runs(runs, is_raised)))
     return Document(
@@ -67,7 +71,7 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
             run_tables.note_on_robot(file, model, f"Varied: {axes}."),
             run_tables.endings_table(statuses, beyond_a_limit=flagged_by_status, where=ranges_by_status),
             catalogue.table("sweep.limits", rows),
-            _extremes(shown_runs, extremes),
+            _extremes(applicable_runs, extreme_columns),
             *remarks(notes),
         ),
         (Section("Over the grid", (catalogue.note("sweep.maps"), *maps), "maps"),),
@@ -76,16 +80,17 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
 
 def sweep_answer(runs: Columns) -> str:
     """One sentence: number of runs with an operating point, and of those within all limits."""
-    total, settled = len(runs["status"]), np.isin(runs["status"], words.SETTLED)
+    total = len(runs["status"])
+    settled = np.isin(runs["status"], words.SETTLED)
     flags = runs["flags"][settled & (runs["flags"] != "")]
     verb = "has" if 1 in (total, settled.sum()) else "have"
-    first_words = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
+    first_part = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
     if not len(flags):
-        return f"{first_words}, all within every limit." if settled.any() else f"{first_words}."
-    ((most_frequent, times),) = Counter(flag for f in flags for flag in str(f).split(";")).most_common(1)
+        return f"{first_part}, all within every limit." if settled.any() else f"{first_part}."
+    ((most_frequent, count),) = Counter(flag for f in flags for flag in str(f).split(";")).most_common(1)
     return (
-        f"{first_words}. {len(flags)} of them {'exceeds' if len(flags) == 1 else 'exceed'} a limit. Most often, "
-        f"{words.FLAGS.get(most_frequent, most_frequent)} ({count_noun(times, 'run')})."
+        f"{first_part}. {len(flags)} of them {'exceeds' if len(flags) == 1 else 'exceed'} a limit. Most often, "
+        f"{words.FLAGS.get(most_frequent, most_frequent)} ({count_noun(count, 'run')})."
     )
 
 
@@ -95,26 +100,29 @@ def _axes(runs: Columns) -> list[str]:
     return [c for c in axes if c in runs and (runs[c].dtype.kind not in "fiu" or not np.isnan(runs[c]).all())]
 
 
-def _levels(runs: Columns, name: str, pick: np.ndarray | slice = slice(None), most: int = 8) -> str:
+def _levels(runs: Columns, name: str, rows: np.ndarray | slice = slice(None), max_listed: int = 8) -> str:
     """Values of an axis for the selected runs, in words: `slope 0, 10°`."""
-    values, column = runs[name][pick], quantity_column(name)
+    values = runs[name][rows]
+    column = quantity_column(name)
     levels = np.unique(values)
     if levels.dtype.kind not in "fiu":
         return ", ".join(dict.fromkeys(map(str, values)))
     unit = column.unit if column.unit == "°" else f" {column.unit}"
-    if levels.size > most:
+    if levels.size > max_listed:
         return f"{column.heading} {levels[0]:.3g} to {levels[-1]:.3g}{unit} ({levels.size} values)"
     return f"{column.heading} {', '.join(f'{v:.4g}' for v in levels)}{unit}"
 
 
-def _ranges_of_runs(runs: Columns, pick: np.ndarray) -> str:
+def _ranges_of_runs(runs: Columns, rows: np.ndarray) -> str:
     """Ranges of slope and imposed quantity for the selected runs, by configuration, in words."""
     parts = []
-    for kind in dict.fromkeys(map(str, runs["configuration"][pick])):
-        of_kind = pick & (runs["configuration"] == kind)
-        names = [c for c in ("slope_deg", imposed_column(runs)) if c in runs and not np.isnan(runs[c][of_kind]).all()]
-        ranges = "; ".join(_levels(runs, c, of_kind, 4) for c in names)
-        parts.append(f"{int(of_kind.sum())} of {kind} ({ranges})")
+    for configuration in dict.fromkeys(map(str, runs["configuration"][rows])):
+        rows_here = rows & (runs["configuration"] == configuration)
+        names = [
+            c for c in ("slope_deg", imposed_column(runs)) if c in runs and not np.isnan(runs[c][rows_here]).all()
+        ]
+        ranges = "; ".join(_levels(runs, c, rows_here, 4) for c in names)
+        parts.append(f"{int(rows_here.sum())} of {configuration} ({ranges})")
     return ", ".join(parts)
 
 
@@ -144,11 +152,11 @@ def campaign_document(file: RobotFile, layout: zarr_store.StoreLayout, result: J
         store: folder of the store.
     """
     counts, model, total = result["statuses"], result["model"], result["points"]
-    reached = sum(counts.get(s, 0) for s in words.SETTLED)
-    verdict_words = words.VERDICTS.get((model, "converged"), "have an operating point")
+    solved_points = sum(counts.get(s, 0) for s in words.SETTLED)
+    verdict_phrase = words.VERDICTS.get((model, "converged"), "have an operating point")
     return Document(
         f"Sweep of {count_noun(total, 'point')}",
-        f"{count_noun(total, 'point')}: {reached:,} {verdict_words}.",
+        f"{count_noun(total, 'point')}: {solved_points:,} {verdict_phrase}.",
         (
             run_tables.note_on_robot(file, model, f"All points are in `{zarr_store.STORE}`."),
             run_tables.endings_table(counts, "points", model),
@@ -165,19 +173,26 @@ def _sections(store: Path, layout: zarr_store.StoreLayout, extremes: Json) -> It
     }
     yield Section("What varies", (_varied_rows(layout, varied),), "varied")
     if VERDICT in points:
-        codes, axes = points[VERDICT].astype(int), layout.design.axes
+        codes = points[VERDICT].astype(int)
+        axes = layout.design.axes
         meanings = layout.variables[VERDICT][1]["flag_meanings"].split()
         rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
         blocks: list[Block] = [
             Note(_largest_obstacle(varied, points), "answer", "largest"),
             catalogue.table("campaign.endings", rows),
         ]
-        first = next((n for n in layout.design.names if n != SIZE and n in axes and len(axes[n]) > 1), None)
-        if first is not None and SIZE in axes:
-            others = (q.values == axes.get(n, q.values)[0] for n, q in varied.items() if n not in (SIZE, first))
-            at_first = np.all([np.ones(len(codes), bool), *others], axis=0)
-            drawn = (_at_points(varied, at_first)[n] for n in (first, SIZE))
-            blocks.append(catalogue.figure("campaign.endings", codes[at_first], meanings, *drawn))
+        first_axis = next(
+            (name for name in layout.design.names if name != SIZE and name in axes and len(axes[name]) > 1), None
+        )
+        if first_axis is not None and SIZE in axes:
+            others = (
+                q.values == axes.get(name, q.values)[0]
+                for name, q in varied.items()
+                if name not in (SIZE, first_axis)
+            )
+            is_drawn = np.all([np.ones(len(codes), bool), *others], axis=0)
+            drawn_quantities = (_at_points(varied, is_drawn)[name] for name in (first_axis, SIZE))
+            blocks.append(catalogue.figure("campaign.endings", codes[is_drawn], meanings, *drawn_quantities))
         yield Section("How the climbs ended", tuple(blocks), "verdicts")
     yield Section("What came out", tuple(_outputs(varied, points, layout, extremes)), "outputs")
 
@@ -187,24 +202,26 @@ def _at_points(varied: Mapping[str, VariedQuantity], rows: np.ndarray) -> dict[s
 
 
 def _outputs(
-    varied: Mapping[str, VariedQuantity], found: Columns, layout: zarr_store.StoreLayout, extremes: Json
+    varied: Mapping[str, VariedQuantity], points: Columns, layout: zarr_store.StoreLayout, extremes: Json
 ) -> Iterable[Block]:
     """Section on the outputs, with extremes and quantiles. The first ones are drawn."""
-    settled = np.isin(found[STATUS], signals.DONE)
-    rows, figures = list[tuple[Any, ...]](), list[Figure]()
+    settled = np.isin(points[STATUS], signals.DONE)
+    rows = list[tuple[Any, ...]]()
+    figures = list[Figure]()
     for name, (_, attributes) in layout.variables.items():
         if "units" not in attributes:
             continue
-        label, unit = attributes["long_name"], attributes["units"].removeprefix("1")
-        usable = settled & np.isfinite(found[name])
-        numbers = found[name][usable].astype(float)
+        label = attributes["long_name"]
+        unit = attributes["units"].removeprefix("1")
+        is_usable = settled & np.isfinite(points[name])
+        numbers = points[name][is_usable].astype(float)
         quantiles = np.quantile(numbers, (0.05, 0.5, 0.95)) if len(numbers) else [None] * 3
         rows.append((label, unit, extremes[name]["least"], *quantiles, extremes[name]["greatest"]))
         if len(numbers) and len(figures) < DRAWN:
-            drawn = numbers, Column(label, unit).title, _at_points(varied, usable)
+            drawing = numbers, Column(label, unit).title, _at_points(varied, is_usable)
             figures.append(
                 catalogue.figure(
-                    "campaign.spread", *drawn, finding=f"{label} against the inputs", words=(label.capitalize(),),
+                    "campaign.spread", *drawing, finding=f"{label} against the inputs", words=(label.capitalize(),),
                     suffix=name,
                 )
             )  # fmt: skip
@@ -214,20 +231,21 @@ def _outputs(
     yield from figures
 
 
-def _largest_obstacle(varied: Mapping[str, VariedQuantity], found: Columns) -> str:
+def _largest_obstacle(varied: Mapping[str, VariedQuantity], points: Columns) -> str:
     """Largest obstacle climbed and its first point, in words."""
-    sizes = found[LARGEST] if LARGEST in found else varied[SIZE].values * (found[VERDICT] == OVER)
+    sizes = points[LARGEST] if LARGEST in points else varied[SIZE].values * (points[VERDICT] == OVER)
     k = int(np.argmax(sizes))
     if sizes[k] <= 0:
         return "The robot gets over no obstacle."
-    places = []
+    conditions = []
     for name, quantity in varied.items():
         if name != SIZE:
-            value, unit = quantity.values[k], quantity.label.removeprefix(name).strip(" []")
-            words = quantity.words[int(value)] if quantity.words else f"{value:.4g} {unit}".strip()
-            places.append(f"{name} {words}")
-    rest = f", at {', '.join(places)}" if places else ""
-    return f"The largest obstacle that the robot gets over: {sizes[k]:.4g} mm{rest}."
+            value = quantity.values[k]
+            unit = quantity.label.removeprefix(name).strip(" []")
+            value_text = quantity.words[int(value)] if quantity.words else f"{value:.4g} {unit}".strip()
+            conditions.append(f"{name} {value_text}")
+    place_text = f", at {', '.join(conditions)}" if conditions else ""
+    return f"The largest obstacle that the robot gets over: {sizes[k]:.4g} mm{place_text}."
 
 
 def _unit(layout: zarr_store.StoreLayout, name: str) -> str:
