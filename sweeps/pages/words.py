@@ -65,12 +65,12 @@ FILES = {
 }
 
 
-#: What `verdict` in result.json of the loop means, the least first; an alias after its word.
+#: Meanings of `verdict` in result.json of the loop, the least established first. Former words follow their new ones.
 LOOP_VERDICTS = {
     "none": "the residuals of the fitted model are consistent with noise",
     "undescribed": (
-        "error or noise of a channel exceeds a quarter of the measured rms after the refit, and no set of effects "
-        "halves it on unseen runs and brings it below a quarter"
+        "error or noise of a channel exceeds a quarter of the measured rms after the refit. No set of effects halves "
+        "it on unseen runs and brings it below a quarter"
     ),
     "place": "a term is missing in one equation, or in one of several that data cannot distinguish",
     "unnamed": "former word for place, and up to schema mmrjax.loop/3 for mechanism",
@@ -138,9 +138,9 @@ FLAGS = {
 }
 
 
-#: Shown for the final temperature of a winding at a current for which the temperature never settles.
+#: Text for the final temperature of a winding at a current for which the temperature never settles.
 NONE_SETTLES = "none settles"
-#: Shown for a current at which the winding never reaches its limit.
+#: Text for the permissible time of a current at which the winding never reaches its limit.
 FOR_EVER = "continuously"
 
 #: Statuses of runs that ended in a steady state; `signals.DONE` by name.
@@ -154,7 +154,7 @@ def every_run_solved(counted: Mapping[str, int]) -> bool:
     return not counted.get("failed")
 
 
-#: Outcomes of a requirement's quantity other than the status of a run, in one line.
+#: Outcomes of a requirement's quantity that are not statuses of a run.
 OUTCOMES = {
     "unbounded": "no value: the temperature never settles",
 }
@@ -165,12 +165,12 @@ NO_TURN = "there is no settled turn. Simulate it with --model drive"
 
 
 def short_status(status: str) -> str:
-    """A status as figures show it."""
+    """Label of a status for figures and tables."""
     return STATUSES.get(status, (status, ""))[0]
 
 
 def status_meaning(status: str) -> str:
-    """A status for the reader of a report."""
+    """Meaning of a status in one sentence."""
     return STATUSES.get(status, (status, ""))[1]
 
 
@@ -178,10 +178,10 @@ _PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
 
 
 def displayed_robot_name(name: str) -> str:
-    """A robot's name as a page shows it."""
+    """Name of a robot on pages."""
     return _PAPERS_NAMES.get(name, name)
 
 
 def short_name(name: str) -> str:
-    """A parameter's name without the group names that carry no information."""
+    """Name of a parameter without the groups `ground`, `track` and `effects`."""
     return name.replace("ground.", "").replace("track.", "").replace("effects.", "")
