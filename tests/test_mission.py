@@ -314,3 +314,13 @@ def test_wrong_profiles_are_said(message):
 def test_every_unit_and_name_of_totals_is_integrated():
     assert all(set(energy.SINKS) < set(law.TOTALS) for law in (mission_straight, mission_turning))
     assert isinstance(rows([0, 1]), Profile)
+
+
+@pytest.mark.slow
+def test_cells_that_stay_below_their_cut_off_end_the_mission(robot):
+    weak = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=3.9))
+    found = run(weak, asked(battery=1.0, discharge=2500.0), rows([0, 3600]))
+    assert "cut_off" in flagged(found.result.flags) and STATUSES[int(found.result.status)] == "cut_off"
+    assert found.total.time < 1000.0
+    started = run(robot, asked(battery=1.0), rows([0, 5]))  # the inrush alone does not count
+    assert float(started.peaks["cell_low"]) < 3.0 and "cut_off" not in flagged(started.result.flags)

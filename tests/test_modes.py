@@ -6,11 +6,13 @@ from itertools import pairwise
 import jax
 import numpy as np
 import pytest
+from scipy.optimize import fsolve
 
+from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import GRAVITY
 from mmrjax.undercarriage.half_robot import advance, build_system, roll
-from mmrjax.undercarriage.modes import Mode, modes
+from mmrjax.undercarriage.modes import POSITIONS, Mode, _linearised_steps, _run_modes, modes
 
 PAYLOADS = [0.0, 8.0]
 
@@ -90,3 +92,30 @@ def test_mode_over_an_octave_is_no_frequency_to_meet():
     mode = Mode("pitch", 59.0, 11.0, 106.0, 60.0, 0.17, 0.7, 1.0)
     assert mode.amplifies and not mode.resonant
     assert mode._replace(low=60.0).resonant
+
+
+@pytest.mark.slow
+def test_bounce_on_tracks_is_that_of_a_mass_on_its_grousers(robot):
+    """Nine grousers half a pitch from the arcs. Towards the ends the belt yields as a string of 100 N."""
+    rates, masses = jax.device_get(
+        _linearised_steps(params.without_weak_types(robot), conditions(robot, "6T2A"), POSITIONS)
+    )
+    middle = POSITIONS // 2
+    found = named(_run_modes(rates[0, middle : middle + 1], masses[0, middle : middle + 1]), "bounce")
+    along = 0.0175 + 0.035 * np.arange(9)
+    lever = 0.15 - along
+    nearer = np.clip(np.minimum(along, 0.3 - along), 0, 0.02) / 0.02
+    yields = nearer * (1 - nearer) * 0.02 / 100.0
+
+    def force(depth):
+        depth = np.maximum(depth, 1e-12)
+        return 3e7 * depth**1.5 / (1 + yields * 3e7 * depth**0.5)
+
+    weight = 13.1 / 2 * GRAVITY
+    z, turn = fsolve(
+        lambda y: [(force(y[0] + y[1] * lever).sum() / weight - 1), (force(y[0] + y[1] * lever) @ lever) / weight],
+        [5e-5, 0.0],
+    )
+    depth = z + turn * lever
+    stiffness = ((force(depth + 1e-9) - force(depth - 1e-9)) / 2e-9).sum()
+    assert found.natural == pytest.approx(np.sqrt(stiffness / (13.1 / 2)) / (2 * np.pi), rel=0.03)

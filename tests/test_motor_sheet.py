@@ -3,11 +3,14 @@
 import itertools
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from calibration.data import robot_file
 from sweeps.commands import rig_numbers
 from sweeps.commands.rig_new import write_new_rig
+from tests.commands import ends, read_json
 
 #: maxon RE30 310007, as printed.
 RE30 = {
@@ -75,3 +78,37 @@ def test_rig_new_lists_what_robot_and_sheet_do_not_state(mmrjax, tmp_path):
     assert text.startswith("# kind wheeled, filled from joint left_wheel_joint of diffbot.urdf and a data sheet.")
     found = robot_file.read_robot(tmp_path / "r.toml")
     assert (float(found.motor.resistance), float(found.gearbox.ratio)) == (0.611, 34.0)
+
+
+@pytest.mark.slow
+def test_viscous_friction_of_a_motor_does_not_look_like_a_missing_effect(mmrjax, tmp_path):
+    """A brake test of a motor, more than half of whose no-load torque is viscous, with a file from its sheet."""
+    draw, resistance, constant, coulomb, viscous = np.random.default_rng(3), 0.62, 0.0262, 0.0035, 5e-6
+
+    def balance(volts, torque):
+        """Speed and current of U = R I + k ω, k I = M_0 + K ω + M."""
+        speed = (constant * volts / resistance - coulomb - torque) / (constant**2 / resistance + viscous)
+        return speed, (coulomb + viscous * speed + torque) / constant
+
+    volts, torque = (x.ravel() for x in np.meshgrid(np.arange(6.0, 25.0, 3.0), [0.0, 0.02, 0.05, 0.08]))
+    speed, current = balance(volts, torque)
+    runs = {
+        "supply_voltage_V": volts, "load_torque_Nm": torque,
+        "motor_current_A": current + draw.normal(0, 0.01, volts.size), "motor_current_sd_A": np.full(volts.size, 0.01),
+        "motor_speed_rpm": speed * 30 / np.pi + draw.normal(0, 10, volts.size),
+        "motor_speed_sd_rpm": np.full(volts.size, 10.0),
+    }  # fmt: skip
+    pd.DataFrame(runs).to_csv(tmp_path / "runs.csv", index=False)
+    fastest, idle = balance(24.0, 0.0)
+    sheet = {
+        "voltage": "24 V",
+        "no-load-current": f"{idle} A",
+        "no-load-speed": f"{fastest} rad/s",
+        "resistance": "0.62 ohm",
+    }
+    write_new_rig(tmp_path / "rig.toml", "dyno", False, sheet=sheet)
+    ends(mmrjax("loop runs.csv --robot rig.toml --out out --no-report"), code=0)
+    assert read_json(tmp_path / "out/result.json")["verdict"] == "none"
+    fitted = robot_file.read_robot(tmp_path / "out/fitted.toml").motor
+    assert fitted.friction_viscous == pytest.approx(viscous, rel=0.1)
+    assert fitted.friction_coulomb == pytest.approx(coulomb, rel=0.1)

@@ -477,3 +477,30 @@ def test_a_search_that_hardly_lowers_its_objective_ends(monkeypatch):
     soon = search()
     monkeypatch.setattr(fit, "STALLED", -1.0)
     assert soon <= 2 * fit.LATELY + 1 < search()
+
+
+def test_jacobian_of_steady_is_the_finite_difference(posed, truth):
+    function = jax.jit(lambda z: posed.misfit(z))
+    jacobian = np.asarray(jax.jit(jax.jacfwd(function))(truth))
+    step = 1e-5
+    columns = [
+        (function(truth.at[k].add(step)) - function(truth.at[k].add(-step))) / (2 * step) for k in range(len(truth))
+    ]
+    assert_allclose(jacobian, np.stack(columns, 1), rtol=1e-5, atol=1e-5 * np.abs(jacobian).max())
+
+
+@pytest.mark.nightly
+def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured, robot):
+    """With the noise that is estimated of them the rows pull static friction down to the margin. From just inside of
+    it nothing shows the penalty."""
+    posed = pose(measured, robot, stated="current=10%,motor_speed=6%,speed=4%")
+    limit = fit.search_starts(posed, jnp.zeros((1, len(posed.coordinates))))[0]
+    assert np.any(posed.observation(limit.z[0]).adhesion_used > 1 - problem.MARGIN)
+    inside = jnp.asarray(limit.z[0]).at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
+    r, jacobian, seen = fit.linearise(posed, inside)
+    assert (seen.adhesion_used < 1 - problem.MARGIN)[:10].all()
+    plain = np.linalg.lstsq(np.asarray(jacobian), np.asarray(r))[0]
+    assert 0.5 * np.sum((jacobian @ plain) ** 2) > 3 * fit.DECREMENT  # a gain that is not there
+    found, _, _ = fit.search_rollout(posed, inside)
+    assert found.converged and found.decrement < fit.DECREMENT + fit.DECREMENT_SHARE * float(found.cost)
+    assert found.cost == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)

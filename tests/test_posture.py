@@ -221,3 +221,13 @@ def test_outstretched_levers_turn_more_slowly(robot):
     assert stands.length == pytest.approx(0.7055, abs=1e-4) and stands.on_tracks == 1
     lifted = balances.stance(robot, run(-60.0, -60.0), robot.configurations["6T2A"], jnp.asarray(13.1))
     assert lifted.on_tracks == 0
+
+
+@pytest.mark.slow
+def test_highest_step_falls_by_what_the_levers_mass_moves(robot):
+    """By hand 229 mm: the centre of mass as high as with folded levers, 12.5 mm further back."""
+    moved = 2 * 0.495 / 13.1 * 0.083 * (1 + math.cos(math.radians(FLUSH)))
+    side = dataclasses.replace(held(robot, 180.0, FLUSH), centre_forward=jnp.asarray(-moved))
+    assert 1e3 * float(highest_step(side).height) == pytest.approx(229, abs=1)
+    # the robot's own parts: its centre of mass is 3.0 mm above the axles then, not 5
+    assert 1e3 * float(limits(robot, run(180.0, FLUSH)).step) == pytest.approx(231.6, abs=0.1)

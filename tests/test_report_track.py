@@ -100,3 +100,13 @@ def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
         document = runs_report.runs_document(RobotFile(robot, "nominal"), "track", table, shown)
         path = page_renderer.write_report_page(tmp_path / name, document)
         assert set(re.findall(r'<figure id="([^"]+)">', path.read_text())) == figures
+
+
+@pytest.mark.slow
+def test_ripple_table_has_the_period_of_equation_34(written, period):
+    cells = re.search(r'id="ripple-table">.*?<tr><td class="words">6T2A</td>(.*?)</tr>', written[1], re.S).group(1)
+    found, expected, current, speed, reaction, guide = map(float, re.findall(r"<td>([^<]+)</td>", cells))
+    assert expected == pytest.approx(1e3 * period, abs=0.006)  # as printed
+    assert found == pytest.approx(1e3 * period, rel=0.02)
+    assert 2 < current < 20 and 0 < speed < 2 and 5 < reaction < 50
+    assert guide == pytest.approx(100 * written[2].steady.guide_share[0], abs=0.06)

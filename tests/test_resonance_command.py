@@ -6,7 +6,9 @@ from types import SimpleNamespace
 import jsonschema
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from mmrjax.fidelities.track import track_batch
 from mmrjax.model.signals import CONVERGED
 from mmrjax.undercarriage.modes import Mode
 from sweeps import config
@@ -165,3 +167,17 @@ def test_resolved_configuration_is_read_again(tracked):
     assert 'model = "track"' in text and "voltages_V = [24.0, 26.0" in text
     again = config.resolve_configuration(config.Resonance, tracked[0] / "config.resolved.toml", {})
     assert again.payloads_kg == (0.0, 8.0) and again.options["duration"] == 1.0
+
+
+@pytest.mark.parametrize("tracked", KINDS[1:], indirect=True)
+def test_ripple_of_reaction_is_that_of_the_track_model(robot, tracked):
+    """Of every point, from the runs themselves, their drift left in."""
+    found = tracked[1]
+    again = config.resolve_configuration(config.Resonance, tracked[0] / "config.resolved.toml", {})
+    conditions = run.conditions_of_runs(
+        robot, room.grid_conditions(room._speed_grid(again, again.voltages_V), robot), again
+    )
+    runs = track_batch(robot, conditions, duration=1.0, step=1e-4, rolling=True, progress=lambda share: None)
+    normal = np.asarray(runs.signals.normal)[:, 500:]
+    ripple = 100 * normal.std(axis=1) / normal.mean(axis=1)
+    assert_allclose(found.table["reaction_ripple_percent"], ripple, rtol=0.02)

@@ -243,3 +243,62 @@ def test_a_report_shows_a_dash_for_a_channel_without_readings():
     table = fit_tables.rms_table({"before": {"speed": 1.0}}, shown)
     (row,) = table.rows
     assert [column.text(cell) for column, cell in zip(table.columns, row, strict=True)] == ["before", "1", "–"]
+
+
+MOTOR = """
+schema = "mmrjax.robot/2"
+base = "none"
+sides = 1
+imposed = "voltage"
+channels = ["motor_current", "motor_speed"]
+[motor]
+resistance = "2.3 ± 5 %"
+torque_constant = "0.021 ± 3 %"
+friction_coulomb = "0.002 ± 20 %"
+friction_viscous = "1e-6 ± 50 %"
+inertia = 6e-6
+[gearbox]
+ratio = 1.0
+efficiency_load = "1 ± 0"
+[bench]
+load = "shaft"
+inertia = 1e-8
+loss_coulomb = "0 ± 0"
+loss_viscous = "0 ± 0"
+[columns]
+supply_voltage_V = "U [V]"
+motor_current_A = {column = "Strom [mA]", factor = 1e-3}
+motor_speed_rpm = "Drehzahl [1/min]"
+"""
+
+
+def precise_table(path):
+    """Settled runs of a motor with a brake of air, 6 nN·m·s², read to a thousandth, as a logger far from here writes
+    them. From the laws in NumPy."""
+    volts = np.array([5, 6.5, 8, 9.5, 11, 12.5, 14, 15.5, 17, 18.5, 20, 22, 24, -7, -11, -15, -19, -23])
+    r, k, dry, viscous, air = 2.3, 0.021, 0.0022, 1.1e-6, 6e-9
+    # k (u - k w) / r = dry + viscous w + air w², of magnitudes
+    size = np.abs(volts)
+    b, c = viscous + k * k / r, dry - k * size / r
+    speed = np.sign(volts) * (-b + np.sqrt(b * b - 4 * air * c)) / (2 * air)
+    random = np.random.default_rng(5)
+    current = 1e3 * ((volts - k * speed) / r + 5e-4 * random.normal(size=len(volts)))
+    rpm = speed * 30 / np.pi + 0.6 * random.normal(size=len(volts))
+    lines = ["U [V];Strom [mA];Drehzahl [1/min];motor_current_sd_mA;motor_speed_sd_rpm"]
+    lines += [f"{u:g};{i:.3f};{n:.2f};0.5;0.6".replace(".", ",") for u, i, n in zip(volts, current, rpm, strict=True)]
+    path.write_text("\n".join(lines) + "\n", encoding="cp1252")
+    return path
+
+
+@pytest.mark.nightly
+def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
+    """170 σ of it: without the effect the fit is so far off that by its slopes another effect would explain more."""
+    (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
+    data = precise_table(tmp_path / "runs.csv")
+    _, told, _ = ends(mmrjax("loop", data, "--robot", "motor.toml", "--replicates", "250", "--out", "found"), code=0)
+    found = read_json(tmp_path / "found/result.json")
+    assert found["verdict"] in ("named", "class"), told
+    (effect,) = found["effects"]
+    amplitude = effect["parameters"]["amplitude"]
+    assert effect["standing"] == "established" and effect["name"] in ("churning", "windage")
+    assert abs(amplitude["value"] - 6e-9) < 3 * amplitude["sd"] < 1e-9

@@ -442,3 +442,22 @@ def test_derivatives_through_rest_are_those_of_steps_without_end(through_rest, n
     compute forgets that the moment of rest moves."""
     slope, wide = (x[THROUGH_REST.index(name)] for x in through_rest)
     assert np.linalg.norm(slope - wide) < 0.05 * np.linalg.norm(wide)
+
+
+@pytest.mark.slow
+def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, monkeypatch):
+    """A second of a voltage at 50 Hz, against steps that stay short after each change."""
+    robot = drive(tmp_path, "total_current", "motor_speed", rig="delay = 0.0", inertia=0.002)
+    t = np.arange(0, 1, 0.02)
+    volts = 12 * np.sin(5 * t) + 6 * np.sign(np.sin(11 * t)) + 0.5 * np.random.default_rng(1).standard_normal(50)
+    driven = {"time_s": t, "supply_voltage_V": volts, "total_current_A": 0 * t, "motor_speed_rpm": 0 * t}
+    runs = read_table(tmp_path, csv_text(driven), robot)
+    made = observers.observer_kind(runs).of(runs, robot)
+    shown = np.asarray(made(robot).reading)
+    monkeypatch.setattr(run_grids.histories, "CHANGE", (1e-6, 0.1))
+    monkeypatch.setattr(run_grids, "LONGEST", 5e-5)
+    fine = observers.observer_kind(runs).of(runs, robot)
+    exact = np.asarray(fine(robot).reading)
+    assert made.times.size < 7 * len(runs) and 25 * made.times.size < fine.times.size
+    error = np.sqrt(np.mean((shown - exact) ** 2, 0) / np.mean(exact**2, 0))
+    assert (error < 2e-3).all() and (error > 1e-6).all()

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import configuration_tables, inferred_facts
+from calibration.data import configuration_tables, inferred_facts, robot_file
 from calibration.data import runs as records
 from calibration.inference import bases, blocks, checks, noise, observers, priors
+from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
 from calibration.inference.ranges import check_ranges
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import paper_robots, params
+from mmrjax.model import paper_robots, params, quantities
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import Friction, Ground, Track
@@ -480,3 +481,50 @@ def test_an_offset_of_an_ammeter_is_no_lost_sign(tmp_path):
     assert len(records.read_runs({**table, "motor_current_A": drag + 0.4}, rig)) == 16
     with refused("expected readings with their signs"):
         records.read_runs({**table, "motor_current_A": np.abs(drag)}, rig)
+
+
+@pytest.mark.slow
+def test_a_calibration_of_a_free_instrument_leaves_what_it_found(tmp_path):
+    text = """
+base = "none"
+imposed = "motor_speed"
+channels = ["total_current"]
+[motor]
+torque_constant = "0.05 ± 3 %"
+friction_coulomb = "0.004 ± 20 %"
+[gearbox]
+ratio = 16
+efficiency_load = 0.8
+[brake]
+load = "shaft"
+inertia = 0.001
+loss_coulomb = "0.1 ± 50 %"
+loss_viscous = "0.002 ± 50 %"
+[instruments.total_current]
+signed = "free"
+quantum = "free"
+"""
+    robot = read_rig(tmp_path, text)
+    assert robot.rig.instruments == (Instrument("total_current", None, None),)
+    robot_file.write_robot(robot, tmp_path / "again.toml", note="of a test")
+    assert robot_file.read_robot(tmp_path / "again.toml").rig.instruments == robot.rig.instruments
+    speeds = np.array([-4000, -3100, -2700, -1900, -1300, -1000, 1000, 1600, 2300, 2900, 3700, 4000.0])
+    robot_there = params.replace(robot, {"brake.loss_coulomb": 0.15})
+    truth = steady_batch(robot_there, Conditions(motor_speed=speeds * quantities.RPM)).reading["total_current"]
+    assert truth[0] < 0  # without a table it is shown with its sign
+    read = np.round(np.abs(truth) / 0.004) * 0.004
+    path = tmp_path / "t.csv"
+    rows = "".join(f"{n:g},{i:.3f},0.002\n" for n, i in zip(speeds, read, strict=True))
+    found = calibrate(
+        records.read_runs(
+            text_file(path, "motor_speed_rpm,total_current_A,total_current_sd_A\n" + rows), robot=robot
+        ),
+        robot,
+        starts=2,
+        profiles=False,
+        blocks=False,
+    )
+    (instrument,) = found.robot.rig.instruments
+    assert instrument.signed is False and instrument.quantum == pytest.approx(0.004, rel=1e-6)
+    loss = found.parameters["brake.loss_coulomb"]
+    assert abs(loss.value - 0.15) < 3 * loss.sd

@@ -248,3 +248,24 @@ def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
     (torque,) = (e for e in scored if e.name == "output_torque_offset")
     size = np.sqrt(np.mean(runs["output_torque_Nm"] ** 2))
     assert amplitude_of(torque()).spec.bounds == pytest.approx(np.array([-1, 1]) * scales.MOST_OFF * size, rel=0.01)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("signed", [True, False])
+def test_a_current_sensors_offset_is_named(tmp_path, signed):
+    """Of a bench driven both ways. Where the sensor shows magnitudes a friction may look alike."""
+    shown = f"[instruments.motor_current]\nsigned = {str(signed).lower()}\n"
+    robot = read_rig(tmp_path, METERED.replace(', "output_torque"', ', "motor_current"') + shown)
+    off = effects.OF_CHANNELS["motor_current_offset"](amplitude=0.02)
+    volts = np.linspace(4.0, 24.0, 8)[:, None] * [1.0, -1.0]
+    seen = mm.simulate(dataclasses.replace(robot, effects=(off,)), mm.Conditions(voltage=volts.ravel()))
+    read = np.stack([seen.total_current, np.asarray(seen.motor_speed) / RPM, seen.motor_current])
+    sd = 0.003 * np.abs(read).mean(1, keepdims=True)
+    read += sd * np.random.default_rng(1).standard_normal(read.shape)
+    heads = "supply_voltage_V,total_current_A,motor_speed_rpm,motor_current_A,"
+    heads += "total_current_sd_A,motor_speed_sd_rpm,motor_current_sd_A"
+    rows = np.column_stack([volts.ravel(), read.T, np.broadcast_to(sd.T, read.T.shape)])
+    np.savetxt(tmp_path / "runs.csv", rows, "%.6g", ",", header=heads, comments="")
+    found = mm.discover(records.read_runs(tmp_path / "runs.csv", robot=robot), robot)
+    assert found.verdict in ("named", "class") and [e.name for e in found.effects] == [off.name]
+    assert found.effects[0].parameters["amplitude"].value == pytest.approx(0.02, abs=0.005)

@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import time
 
 import numpy as np
 import pytest
@@ -554,3 +555,36 @@ def test_a_command_beyond_what_the_driver_gives_is_said_with_its_limit(tmp_path,
         return
     row, shown = re.search(r"row (\d+), supply_voltage_V: commands .* show ([\d.]+) V at most", found).groups()
     assert abs(command[int(row) - 1]) > limit and float(shown) == pytest.approx(limit, rel=0.05)
+
+
+@pytest.mark.nightly
+def test_sds_hold_over_random_logs(tmp_path):
+    """Holds of 1 to 4 s, lags up to 0.4 s, 50 to 250 Hz, noise, steps, delays and clocks that jitter."""
+    z, levels, kept = [], 0, 0
+    for seed in range(16):
+        rng = np.random.default_rng([77, seed])
+        world = rigs.world(rng, rows=(16, 60))
+        rigs.case(world).write(tmp_path)
+        log = rigs.log(
+            world, rng, hold=rng.uniform(1, 4), rate=rng.choice([50, 100, 250]), lag=rng.uniform(0.02, 0.4),
+            noise=rng.uniform(0.5, 6), jitter=rng.uniform(0, 0.3), delay=rng.choice([0, 0, 0.05]),
+            step=rng.choice([0, 0, 1, 3]),
+        )  # fmt: skip
+        log.write(tmp_path / "log.csv")
+        found = settled(tmp_path, robot_file.read_robot(tmp_path / "rig.toml"))
+        z.append(np.abs(deviations(log, found)).ravel())
+        levels, kept = levels + len(world.conditions), kept + len(found.kept)
+    every = np.concatenate(z)
+    assert 0.8 < np.sqrt(np.mean(every**2)) < 1.25 and np.mean(every > 3) < 0.03 and np.mean(every > 5) < 5e-3
+    assert kept > 0.8 * levels
+
+
+@pytest.mark.slow
+def test_25_000_rows_are_settled_in_seconds(tmp_path):
+    _, _, robot = made(tmp_path, 9, "bench", "voltage", rate=250.0)
+    text = (tmp_path / "log.csv").read_text().splitlines()
+    rows = min(len(text) - 1, 25_000)
+    (tmp_path / "log.csv").write_text("\n".join(text[: rows + 1]) + "\n")
+    began = time.process_time()
+    assert rows > 15_000 and settled(tmp_path, robot).kept
+    assert time.process_time() - began < 10 * rows / 25_000

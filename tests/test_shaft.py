@@ -1,6 +1,7 @@
 """Loads on a shaft and imposed motor speed: against plain formulas, each other, and a pendulum's textbook."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -161,3 +162,45 @@ def test_a_gearbox_carries_the_torque_that_accelerates_the_load_without_effects_
     without, having = (balances.moving_signals(r, Conditions(voltage=24.0), state) for r in both)
     assert without.acceleration_wheel > 1.0
     assert_allclose(without.torque_carried, having.torque_carried, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_of_an_imposed_history_are_differences():
+    conditions = Conditions(voltage=0.0)
+    times = jnp.linspace(0, 0.5, 11)
+    speed = 60 * jnp.sin(8 * times)
+    slope = jnp.concatenate([jnp.diff(speed) / jnp.diff(times), jnp.zeros(1)])
+    conditions = dataclasses.replace(conditions, motor_speed=speed, motor_acceleration=slope)
+
+    def current(x):
+        return history_signals(params.replace(bench(), {"bench.inertia": x}), conditions, times).current
+
+    slope = jax.jvp(current, (jnp.asarray(0.01),), (jnp.asarray(1.0),))[1]
+    difference = (current(0.01 + 1e-6) - current(0.01 - 1e-6)) / 2e-6
+    assert_allclose(slope, difference, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_beginning_of_a_history_has_derivatives():
+    def speed(x):
+        rig = Rig(begins=RunStarts({"begin": RunStart(motor_speed=x)}))
+        conditions = dataclasses.replace(Conditions(voltage=6.0), begin=jnp.asarray(0))
+        return history_signals(bench(rig=rig), conditions, jnp.asarray(time_grid(np.linspace(0, 0.2, 5)))).speed_motor
+
+    both = jax.jit(lambda x: jax.jvp(speed, (x,), (1.0,)))
+    slope = np.asarray(both(50.0)[1])
+    difference = np.asarray(both(50.0 + 1e-3)[0] - both(50.0 - 1e-3)[0]) / 2e-3
+    assert slope[0] == 1.0 and abs(slope[-1]) > 1e-3
+    assert_allclose(slope, difference, rtol=1e-4, atol=1e-6)
+
+
+def test_power_of_a_shaft_adds_up():
+    """What the motors give goes into friction, the load's torque and the gearbox, instant by instant."""
+    robot = bench(torque_constant=0.3)
+    moving = jax.jit(lambda state: balances.moving_signals(robot, Conditions(voltage=12.0), state))
+    for speed, current in itertools.product((120.0, -120.0), (1.0, -0.5)):
+        s = moving(State(current, speed, speed / 16, 0.0))
+        given = float(s.torque_motor * s.speed_motor)
+        stored = float(2e-6 * s.speed_motor * s.acceleration_wheel * 16 + 0.01 * s.speed_wheel * s.acceleration_wheel)
+        taken = float((s.torque_track_loss + 0.3) * s.speed_wheel)
+        assert given - stored - taken > -1e-9  # the gearbox never adds power

@@ -169,3 +169,22 @@ def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, tmp_path, done
     assert float(found.energy_Wh.sel(payload=0)) == pytest.approx(one["energy_Wh"], rel=1e-6)
     assert float(found.energy_Wh.sel(payload=8)) > one["energy_Wh"] and found.energy_Wh.attrs["units"] == "Wh"
     assert [STATUSES[int(k)] for k in found.status] == ["converged"] * 2 and found.flags.dtype == np.uint16
+
+
+@pytest.mark.slow
+def test_history_follows_the_demand_and_holds_each_segments_peak(done):
+    history, segments = columns_of(done / "history.csv"), columns_of(done / "segments.csv")
+    assert (np.diff(history["time_s"]) > 0).all() and history["time_s"][-1] == pytest.approx(10)
+    cruise = (history["segment"] == 2) & (history["time_s"] % 5 > 1)
+    assert_allclose(history["speed_mm_s"][cruise], 300, rtol=0.01)
+    assert_allclose(history["demanded_speed_mm_s"][cruise], 300)
+    ramp = history["segment"] == 1
+    assert_allclose(history["demanded_speed_mm_s"][ramp], 600 * (history["time_s"][ramp] % 5), atol=1e-4)
+    assert np.isnan(history["demanded_speed_mm_s"][np.isin(history["segment"], (4, 7))]).all()  # it brakes
+    for cycle, segment, peak in zip(segments["cycle"], segments["segment"], segments["peak_current_A"], strict=True):
+        own = (history["cycle"] == cycle) & (history["segment"] == segment)
+        # the peak of a segment counts the instant that it begins in too
+        # (half of it has nine digits in the file, of which the last is rounded)
+        assert 2 * np.abs(history["motor_current_A"][own]).max() <= peak * (1 + 1e-8)
+    assert 2 * np.abs(history["motor_current_A"]).max() == pytest.approx(segments["peak_current_A"].max())
+    assert history["energy_Wh"][-1] == pytest.approx(segments["energy_Wh"].sum(), rel=1e-6)

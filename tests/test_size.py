@@ -4,13 +4,15 @@ import itertools
 import math
 
 import jax
+import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import requirements_file, robot_file
 from calibration.sizing import design_search, sheet
-from calibration.sizing.design import build_robot, build_sizing_task
+from calibration.sizing.design import build_robot, build_sizing_task, evaluate_design
 from calibration.sizing.part_options import (
     BELT_STAGE,
     MOTOR,
@@ -218,3 +220,23 @@ def test_ratings_of_parts_are_asked_somewhere_whatever_else_is(robot, name):
         options_for_robot(robot),
     )
     assert all(rows for _, rows in of.demands) and of.demands and of.travelling
+
+
+@pytest.mark.slow
+def test_margins_are_differentiable(robot, asked, found):
+    of, choice = space(robot, asked, found)
+    f = found.best
+    row = next(k for k in range(len(choice.drive)) if found.options.drives[choice.drive[k]] == f.drive)
+    x = np.log([[f.ratio * 1.01, f.radius * 0.97, f.parallel * 1.1]])
+    design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x))
+
+    @jax.jit
+    def margins(x):
+        objectives, g = evaluate_design(of, type(design)(x, design.drive, design.cell, design.cells))
+        return jnp.concatenate([objectives[:2], g])
+
+    exact = np.asarray(jax.jacrev(margins)(jnp.asarray(x[0])))
+    for k in range(3):
+        step = 1e-5 * np.eye(3)[k]
+        difference = (np.asarray(margins(x[0] + step)) - np.asarray(margins(x[0] - step))) / 2e-5
+        assert_allclose(exact[:, k], difference, rtol=1e-3, atol=1e-5)

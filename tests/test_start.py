@@ -1,5 +1,6 @@
 """Runs from standstill as they are written: by the clock of the rig, with the slip over the stages of the start."""
 
+import jax
 import jax.numpy as jnp
 import jsonschema
 import numpy as np
@@ -144,3 +145,20 @@ def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history
     shown = simulate.history_table(robot, history, Runs())
     assert_allclose(shown["speed_mm_s"], (0.5 * t[0]) / MM)
     assert_allclose(shown["slip"], [0, 0.5, 0.5, 0.5])
+
+
+def test_the_delay_of_histories_is_the_one_of_fits():
+    """What is between instants is the straight line between instants, held beyond them, also where a run ends in no numbers."""
+    t, delay = np.array([0.0, 0.01, 0.03, 0.08]), 0.004
+    x = np.stack([np.sin(40 * t), t**2], 1)
+
+    def late(delay, values, at):
+        return Rig.between(jnp.asarray(values), *Rig(delay=delay).before(jnp.asarray(t), at))
+
+    at = np.array([0.0, 0.003, 0.004, 0.014, 0.02, 0.07, 0.2])
+    ended = np.where(t > 0.02, np.nan, t)
+    got, last = jax.jit(lambda: (late(delay, x, at), late(delay, ended, 0.01 + delay)))()
+    assert_allclose(got, np.stack([np.interp(at - delay, t, c) for c in x.T], 1), rtol=1e-12, atol=1e-15)
+    assert last == pytest.approx(0.01)
+    slope = jax.jit(jax.grad(lambda d: late(d, x[:, 1], 0.05)))(delay)
+    assert slope == pytest.approx(-(0.08**2 - 0.03**2) / 0.05)

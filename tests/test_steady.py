@@ -224,3 +224,13 @@ def test_steady_bad_members_leave_neighbours_values_and_gradients(theta, speed_a
     status = names(answer)[1::2]
     for (name, _), got in zip(BAD.items(), status, strict=True):
         assert got != "converged" or name == "huge", name
+
+
+@pytest.mark.slow
+def test_steady_downhill_gearbox_never_gives_power(robot):
+    slopes = np.linspace(-0.25, 0.0, 26)
+    answer = steady_batch(robot, Conditions(voltage=24.0, slope_deg=np.degrees(slopes), configuration=1))
+    assert set(names(answer)) == {"converged"}
+    assert (answer.power_motor >= answer.power_gear).all()
+    assert (answer.power_gear < 0).any()  # the robot does overhaul its drive
+    assert (np.diff(answer.total_current) > 0).all()

@@ -131,3 +131,27 @@ def test_steady_blocks_change_no_number(robot, monkeypatch, size):
 
 
 # --- derivatives ------------------------------------------------------------------------------------
+
+
+PARAMETERS = ("motor.resistance", "6T2A.mass", "gearbox.ratio", "4W2T.ground.friction.static")
+
+
+WANTED = ("total_current", "speed", "efficiency_chassis")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effects", [False, True])
+def test_derivatives_in_reverse_are_those_forward(robot, effects):
+    robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
+    at = jnp.asarray([p.value for name in PARAMETERS for p in params.walk_parameters(robot) if p.name == name])
+
+    def numbers(x):
+        return steady_outputs(params.replace(robot, dict(zip(PARAMETERS, x, strict=True))), runs, WANTED)
+
+    found, wanted = jax.jacrev(numbers)(at), jax.jacfwd(numbers)(at)
+    numberless = steady_batch(robot, runs).status >= STATUSES.index("slides")
+    assert list(numberless) == [False, True, False, False, False, True]
+    for output in WANTED:
+        for k, parameter in enumerate(PARAMETERS):
+            assert_allclose(found[output][:, k], wanted[output][:, k], rtol=1e-10, atol=1e-13, err_msg=parameter)
+            assert not np.asarray(found[output][:, k])[numberless].any()

@@ -77,3 +77,22 @@ def test_steady_derivatives_at_zero_slip_are_finite(theta, derivatives):
     run = Conditions(voltage=24.0, slope_deg=np.degrees(-np.arctan(0.06)))
     values, forward, reverse, _ = derivatives(theta, run)
     assert np.isfinite(values).all() and np.isfinite(forward).all() and np.isfinite(reverse).all()
+
+
+@pytest.mark.slow
+def test_steady_second_derivatives_are_central_differences(rebuild, theta, free, scales):
+    """Of the speed by three parameters, through the implicit derivative twice."""
+    from mmrjax.fidelities.steady import steady
+
+    names = [p.name for p in free]
+    chosen = [names.index(n) for n in ("motor.resistance", "6T2A.mass", "6T2A.ground.friction.static")]
+    run = Conditions(voltage=24.0, slope_deg=np.degrees(0.08))
+    size = jnp.asarray(scales)[jnp.asarray(chosen)]
+
+    def speed(x):
+        return steady(rebuild(theta.at[jnp.asarray(chosen)].add(x * size)), run).speed
+
+    hessian = jax.jit(jax.hessian(speed))(jnp.zeros(3))
+    slope = jax.jit(jax.grad(speed))
+    central = np.stack([(slope(1e-4 * e) - slope(-1e-4 * e)) / 2e-4 for e in np.eye(3)])
+    assert_allclose(hessian, central, rtol=1e-5, atol=1e-8)

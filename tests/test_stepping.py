@@ -229,3 +229,25 @@ def test_conditions_by_name_are_an_argument_of_compiled_functions(robot):
         of_others.resolved(robot)
     with pytest.raises(KeyError, match="no configuration legs"):
         jax.jit(lambda c: c.resolved(robot).configuration)(mm.Conditions(["6T2A", "legs"]))
+
+
+@pytest.mark.slow
+def test_steps_converge(robot):
+    """Against a hundred times as many, over a command that changes: the figures that the docstring states."""
+    conditions = RUNS["wheeled"]
+    duties = np.repeat([1.0, 0.4, -0.5, 0.0], 40)
+
+    def run(parts):
+        @jax.jit
+        def whole(duties):
+            def one(state, duty):
+                part = lambda state, _: (mm.step(robot, state, duty, DT / parts, conditions), None)  # noqa: E731
+                state = jax.lax.scan(part, state, None, length=parts)[0]
+                return state, state
+
+            return jax.lax.scan(one, mm.initial_state(robot, conditions), duties)[1]
+
+        return whole(jnp.asarray(duties))
+
+    exact, found = run(100), run(1)
+    assert np.abs(found.speed - exact.speed).max() < 4e-3 and np.abs(found.distance - exact.distance).max() < 1e-4

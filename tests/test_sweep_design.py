@@ -199,3 +199,16 @@ def test_points_of_blocks_are_those_of_the_whole(nominal):
 @pytest.mark.parametrize("stated, values", [([False, True], [0, 1]), (True, [1]), ([0, 1], [0, 1])])
 def test_battery_is_an_axis_of_truth_values_too(nominal, stated, values):
     assert planned(nominal, axes={"battery": stated}).design.axes["battery"].tolist() == values
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 10, 97, 1024, 5041])
+def test_permutation_has_each_number_once(number):
+    found = design.keyed_permutation(17, number, np.arange(number, dtype=np.uint64))
+    assert sorted(found.tolist()) == list(range(number))
+
+
+@pytest.mark.parametrize("kind", design.DESIGNS)
+def test_unit_numbers_are_uniform_and_inside(kind):
+    unit = design.DESIGNS[kind](1, 4096, 3, 0, 4096)
+    assert unit.min() > 0 and unit.max() < 1
+    assert all(stats.kstest(row, "uniform").pvalue > 1e-4 for row in unit)

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import json
 import os
 import shutil
 import subprocess
@@ -709,3 +710,32 @@ def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
     (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     _, out, _ = ends(mmrjax("sweep plan.toml --dry-run --chunk 1000"), code=0)
     assert "60,680,000 (2 configuration x 41 slope_deg x 37 voltage x 20 motor.friction_coulomb x 1000 sample)" in out
+
+
+def test_what_is_half_written_is_not_trusted(sweep, whole, monkeypatch, tmp_path):
+    heal = stopping(monkeypatch, 30, KeyboardInterrupt())
+    assert sweep("s")[0] == 130
+    heal()
+    journal = tmp_path / "s.partial/journal/1-of-1.jsonl"
+    lines = journal.read_text().splitlines(keepends=True)
+    assert len(lines) > 3
+    chunk = json.loads(lines[-1][9:])[0]
+    journal.write_text("".join(lines[:-1]) + lines[-1][:-9])  # as if killed while it was written
+    place = xr.open_zarr(tmp_path / "s.partial" / zarr_store.STORE).speed.encoding["chunks"]
+    assert place == (1, 1, 25)
+    where = "/".join(map(str, np.unravel_index(chunk, (2, 3, 2))))
+    victim = tmp_path / "s.partial" / zarr_store.STORE / "speed/c" / where
+    victim.write_bytes(victim.read_bytes()[:11])
+    assert sweep("s")[0] == 0
+    assert arrays("s") == arrays(whole)
+
+
+def test_share_that_another_process_works_on_is_refused(sweep, tmp_path):
+    assert sweep("s", "--shard", "1/3")[0] == 0
+    import fcntl
+
+    with (tmp_path / "s.partial/journal/2-of-3.jsonl").open("a") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        code, _, err = sweep("s", "--shard", "2/3")
+    assert code == 2 and "another process is using s.partial, share 2 of 3" in err
+    assert sweep("s", "--shard", "2/3")[0] == 0

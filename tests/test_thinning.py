@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -187,3 +188,15 @@ def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     assert len(used) < len(runs) == len(used.whole) == len(thin_rows(used, 50).whole)
     with refused("rows: got 0; expected 1 or more", BadConfiguration):
         call(runs, paper_robots.nominal(), rows=0)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("drive", DRIVES)
+def test_a_run_shows_what_it_shows_in_the_whole_log(drive):
+    """Its readings are those of the whole log at the same rows, to what its longer steps make."""
+    whole, robot = log(1, voltage=DRIVES[drive]), paper_robots.nominal()
+    some = thin_rows(whole, 40)
+    shown = [np.asarray(jax.jit(lambda o: o(robot).reading)(Histories.of(x, robot))) for x in (whole, some)]
+    at = [int(np.flatnonzero(whole["time_s"] == t)[0]) for t in some["time_s"]]
+    off = np.abs(shown[1] - shown[0][at]) / np.abs(shown[0]).max(0)
+    assert off.max() < 2e-3

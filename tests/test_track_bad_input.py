@@ -1,10 +1,13 @@
 """What the track model says to input that it cannot run, before and after the run."""
 
+import contextlib
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from calibration.data.input_errors import BadConfiguration
 from mmrjax.fidelities.track import _simulate_batch, track_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -12,6 +15,10 @@ from mmrjax.model.signals import CONVERGED, FAILED, FLAGS, TIPS
 from mmrjax.undercarriage import modes
 from mmrjax.undercarriage.half_robot import build_system, instant, stand, tipping_margin
 from mmrjax.undercarriage.modes import _step_that_divides, largest_step
+from sweeps import config as configuration
+from sweeps.points import run
+from sweeps.points.grid import grid_conditions
+from tests.commands import refused
 
 TWO = Conditions(voltage=[33.0, 33.0], payload=[0.0, 8.0], configuration=[0.0, 1.0])
 
@@ -125,3 +132,18 @@ def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
     answer = _simulate_batch(tall, runs, 1.0, 1e-4, 1e-3, False).result
     assert answer.status.tolist() == [TIPS, CONVERGED]
     assert np.isnan(float(answer.reading["speed"][0])) and np.isfinite(float(answer.reading["speed"][1]))
+
+
+@pytest.mark.slow
+def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot, monkeypatch):
+    options = {"model": "track", "step_s": 5e-4, "chunk": 2, "slopes_deg": (0.0,), "configurations": ("4W2T", "6T2A")}
+    config = configuration.resolve_configuration(configuration.Sweep, None, options)
+    robot = params.replace(robot, {"running_gear.contact_stiffness": 5e9})
+    runs, told = grid_conditions(config, robot), []
+    limits = largest_step(robot, run.conditions_of_runs(robot, runs, config))
+    worst = int(np.argmin(limits))
+    assert limits[:2].min() > config.step_s > limits[worst]  # the first chunk could bear it
+    monkeypatch.setattr(run, "progress_bar", lambda *_, **__: contextlib.nullcontext(told.append))
+    with refused(rf"run {worst + 1} of {len(runs)}", BadConfiguration):
+        run.evaluate_runs(robot, runs, config, None)
+    assert told == []

@@ -202,3 +202,54 @@ def test_run_in_parts_is_the_run_in_one(robot):
     assert jax.tree.structure(whole) == jax.tree.structure(parts)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
         assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
+def test_too_steep_a_slope_slides_it_down(runs):
+    assert runs.q[SLIDING, -1, 0] < -1.0 and runs.result.reading["speed"][SLIDING] < -1.0
+
+
+def test_unpowered_robot_stands_still(runs):
+    assert np.abs(runs.q[UNPOWERED, :, 0]).max() < 1e-4
+
+
+def slipping_stages(time, speed, theoretical, speed_static):
+    """First time of sliding beyond V_s, start of uniform travel [s] and mean slip between, of a run from standstill."""
+    slides = theoretical - speed > speed_static
+    last = speed[-max(len(speed) // 10, 1) :].mean()
+    apart = np.nonzero(slides | (np.abs(speed - last) > 0.01 * abs(last)))[0]
+    uniform = time[min(apart[-1] + 1, len(time) - 1)] if len(apart) else time[0]
+    if not slides.any():
+        return np.nan, uniform, 0.0
+    begin = time[np.argmax(slides)]
+    second = (time >= begin) & (time < uniform)
+    return begin, uniform, np.mean(1 - speed[second] / theoretical[second])
+
+
+@pytest.mark.parametrize("k", [*TRACKED, *WHEELED])
+def test_stages_are_starting_slipping_and_uniform(runs, k):
+    """Figs. 23, 24: V_theoretical runs ahead of V while the robot gathers speed, then they meet."""
+    time, speed, theoretical = runs.time[k], series(runs, k, "speed"), series(runs, k, "speed_theoretical")
+    slipping, uniform, slip = slipping_stages(time, speed, theoretical, 0.02)
+    assert 0 < slipping < 0.05 < uniform < 1.1
+    assert slip > 0.2
+    current = series(runs, k, "total_current")
+    second = (time > slipping) & (time < uniform)
+    # the drop at the end of II is the robot catching up; up to there slipping costs current
+    assert current[second].mean() > 1.02 * current[TAIL].mean() or RUNS[k][0] == 1
+    assert abs(1 - speed[TAIL].mean() / theoretical[TAIL].mean()) < 0.05
+
+
+def test_averages_are_over_whole_periods(runs):
+    for k in TRACKED:
+        window = 0.4 * 1.5 * runs.result.theoretical_speed[k]
+        assert runs.steady.periods[k] == int(window / 0.035)
+    assert runs.steady.periods[UNPOWERED] == 0
+
+
+def test_batch_is_its_members(robot):
+    """vmap = loop: a run does not depend on who runs beside it."""
+    two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
+    twin = jax.tree.map(lambda x: x[::-1], two)
+    a = _simulate_batch(robot, two, 0.05, 1e-4, 1e-3, False)
+    b = _simulate_batch(robot, twin, 0.05, 1e-4, 1e-3, False)
+    assert_allclose(a.q, b.q[::-1], rtol=1e-9, atol=1e-12)

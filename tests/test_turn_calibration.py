@@ -16,7 +16,7 @@ import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.described import describe
-from calibration.inference import blocks, observers, priors
+from calibration.inference import blocks, identifiability, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers.turns import SettledTurns
@@ -181,3 +181,30 @@ def test_truth_of_a_second_implementation_is_found(robot, of_world):
     held = found.held_out["turn"].errors
     assert all(0 < held[name].rms_sigma < 2 for name in SHOWN)
     assert held["yaw_rate"].rms_percent < 2 < found.errors_before["yaw_rate"].rms_percent
+
+
+MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
+
+
+@pytest.mark.slow
+def test_wheels_that_creep_tell_the_effective_width_alone(tmp_path):
+    """Without currents only B + φ_y/φ_x L²/B shows, which the correlation of both says."""
+    robot = mm.read_robot(
+        text_file(tmp_path / "robot.toml", f'base = "nominal"\nchannels = [{", ".join(map(repr, MOTION))}]\n')
+    )
+    duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
+    seen = mm.simulate(robot, mm.Conditions(["4W2T"] * len(DUTIES), voltage=33.0, **duties)).reading
+    mass = float(robot.configurations["4W2T"].mass)
+    table = written(tmp_path / "turns.csv", "4W2T", mass, {name: seen[name] for name in MOTION})
+    runs = records.read_runs(table, robot=robot)
+    names = tuple(f"4W2T.{n}" for n in (LATERAL, WIDTH))
+    sd = np.broadcast_to([channels.find_channel(n).factor * SDS[n] for n in MOTION], runs.measured().shape)
+    about = identifiability.analyse_identifiability(
+        observers.pose_problem(runs, robot, priors.parameter_coordinates(robot, names), sd), jnp.zeros(len(names))
+    )
+    ((one, other, correlation),) = about.correlated()
+    assert {one, other} == set(names)
+    length, width, ratio = 0.3, 0.243, float(robot.configurations["4W2T"].turning.lateral)
+    # At a given effective width: d(ratio)/dB = -(1 - ratio (L/B)²) (B/L)², so here both grow together.
+    slope = -(1 - ratio * (length / width) ** 2) * (width / length) ** 2
+    assert np.sign(correlation) == np.sign(slope)

@@ -1,10 +1,13 @@
 """Settled rows whose tachometer did not read, and rows beyond a limit of supply or driver, are no readings."""
 
+import re
+
 import numpy as np
 import pytest
+from commands import command
 
 from calibration.data import robot_file
-from tests.commands import read_table
+from tests.commands import read_json, read_table
 
 RIG = """base = "none"
 channels = ["total_current", "motor_speed"]
@@ -86,3 +89,50 @@ def test_rows_beyond_full_voltage_are_set_aside_but_for_the_first(stand):
 def test_readings_of_a_sound_stand_are_kept(stand):
     runs = stand()
     assert missing(runs) == {"total_current": [], "motor_speed": []} and not any("limit" in n for n in runs.notes)
+
+
+def stand_of_a_long_table(folder):
+    """Propeller of 76 rows by rising command: the driver gives duty ** 0.77, 8 speeds were not read, 16 rows at 25 A."""
+    from scipy.optimize import brentq
+
+    random, pulses = np.random.default_rng(7), np.linspace(1080, 2000, 76).round()
+    duty = (pulses - 1000) / 1000
+
+    def row(volts, share):
+        drawn = lambda w: (1.1e-7 * w**2 + 0.004) / 0.0072  # noqa: E731
+        speed = brentq(lambda w: volts * share - 0.0072 * w - 0.09 * drawn(w), -1.0, 1e5)
+        return volts, speed * 60 / (2 * np.pi), share * drawn(speed)
+
+    rows = []
+    for share in duty**0.77:
+        sags = brentq(lambda v, s=share: v - 14.8 + 0.01 * row(v, s)[2], 5.0, 14.8)
+        limited = row(sags, share)[2] > 25.0
+        rows.append(row(brentq(lambda v, s=share: row(v, s)[2] - 25.0, 3.0, 14.8) if limited else sags, share))
+    volts, speed, current = np.array(rows).T * (1 + random.normal(0, [[5e-4], [3e-3], [6e-3]], (3, 76)))
+    thrust, read = 0.11 * (speed / 1000) ** 2, np.where(np.arange(76) < 8, 0.0, speed)
+    columns = np.arange(1, 77), pulses, volts, duty, read, current + random.normal(0, 0.02, 76), thrust
+    header = "order,pulse_us,supply_voltage_V,duty,motor_speed_rpm,total_current_A,thrust_N"
+    np.savetxt(folder / "runs.csv", np.array(columns).T, fmt="%.5g", delimiter=",", header=header, comments="")
+    rig = (
+        RIG.replace("0.1 ± 30 %", "0.09 ± 20 %").replace("0.004 ± 5 %", "0.0072 ± 5 %").replace("0.001 ±", "0.004 ±")
+    )
+    (folder / "rig.toml").write_text(rig)
+
+
+@pytest.mark.slow
+def test_a_propeller_has_a_load_with_the_square_of_speed_and_a_law_of_the_driver(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    stand_of_a_long_table(tmp_path)
+    assert command(["loop", "runs.csv", "--robot", "rig.toml", "--out", "found"]) == 0
+    found = read_json(tmp_path / "found/result.json")
+    amplitudes = {e["name"]: e["parameters"]["amplitude"] for e in found["effects"]}
+    load, driver = amplitudes["churning"], amplitudes["duty_exponent"]  # ΔM = a ω², voltage as duty ** (1 + a)
+    assert abs(load["value"] - 1.1e-7) < 3 * load["sd"] < 2e-8
+    assert abs(driver["value"] + 0.23) < 3 * driver["sd"] < 0.06
+    unseen = found["errors"]["after"]["held_out"]
+    assert unseen["total_current"]["rms_percent"] < 6 and unseen["motor_speed"]["rms_percent"] < 8
+    assert "order" not in found["statement"]
+    notes = "".join(capsys.readouterr())
+    assert "0 in rows 1, 2, 3, 4, 5, 6, 7, 8 although the current is a turning motor's" in notes
+    listed, more = re.search(r"rows ([\d, ]+) and (\d+) more: readings no longer change", notes).groups()
+    assert len(listed.split(",")) + int(more) == 16

@@ -21,7 +21,7 @@ from calibration.inference.linearization import balance_probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Histories, settled_ends
 from mmrjax.effects import BY_NAME
-from mmrjax.fidelities.histories import CHANGE, LONGEST, START, time_grid
+from mmrjax.fidelities.histories import CHANGE, LONGEST, START, history_signals, time_grid
 from mmrjax.missions.mission import mission
 from mmrjax.missions.profile import MODES, profile
 from mmrjax.model import paper_robots, params
@@ -344,3 +344,24 @@ def test_a_rig_may_turn_on_forward_while_it_is_driven_backward(runs):
     assert len(back) > 20 and speed[back].min() < -0.5 * speed.max()
     speed[back[5:]] = np.abs(speed[back[5:]])
     Histories.check(changed(runs, motor_speed_rpm=speed), NOTHING)
+
+
+@pytest.mark.slow
+def test_constant_values_at_every_instant_are_those_of_a_constant_run():
+    robot, g = paper_robots.nominal(), jnp.asarray(time_grid(np.arange(0.02, 0.3, 0.02)))
+    one = Conditions(0, 24.0, 5.0, 2.0)
+    many = Conditions(0, jnp.full(len(g), 24.0), 5.0, 2.0)
+    a, b = (history_signals(robot, c, g) for c in (one, many))
+    for name in ("current", "speed_motor", "speed"):
+        assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_payload_that_changes_acts_from_its_sample_on(runs, robot):
+    payload = runs["payload_kg"] + 6.0 * (runs["time_s"] >= 1.25)
+    heavier = Histories.of(changed(runs, payload_kg=payload), robot)
+    assert heavier.conditions.payload.shape == heavier.times.shape
+    seen, before = (np.asarray(eqx.filter_jit(o)(robot).reading[:, 0]) for o in (heavier, Histories.of(runs, robot)))
+    early = runs["time_s"] <= 1.25
+    assert_allclose(seen[early], before[early], rtol=1e-9, atol=1e-12)
+    assert np.abs(seen - before)[runs["time_s"] > 1.4].max() > 0.1  # [A]

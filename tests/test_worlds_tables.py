@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from worlds import laws, machines, settled, tables
 from worlds.machines import ROLES, TRACKS, WHEELS
-from worlds.settled import CLIMBING, readings
+from worlds.settled import CLIMBING, Instruments, readings, remainder
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -139,3 +139,26 @@ def test_robot_file_is_read_and_runs_agree_with_steady(tmp_path, roles):
 
 
 # --- the analyst's priors -----------------------------------------------------------------------------
+
+
+def test_a_term_may_bring_its_own_law_and_see_when_a_row_was_measured():
+    rows = settled.table8().at(np.arange(89, -1, -1))
+    term = laws.Term("drift", 0.1, law=laws.Law("", "track", lambda s, q: s.order, 0.1))
+    y, sound = readings(rows, CLIMBING, [term])
+    change = (y / readings(rows, CLIMBING)[0] - 1)[0]
+    assert sound.all() and change[0] == pytest.approx(0, abs=1e-9) and change[-1] > 5 * change[9] > 0
+    assert (rows.slope == settled.table8().slope[::-1]).all()
+
+
+def test_remainder_of_what_the_constants_can_do_is_small():
+    p, show, name = dict(CLIMBING), Instruments(), "motor.resistance"
+    slopes = settled.base_slopes(GRID, p, show)
+    other = p | {name: p[name] * (1 + 0.5 * settled.TOLERANCES[name])}
+    change = ((readings(GRID, other)[0] - CLEAN) * settled.SHOWN / show.stated[:, None]).ravel()
+    column = slopes[:, list(settled.TOLERANCES).index(name)]
+    assert_allclose(change, 0.5 * column, rtol=0.02, atol=0.02 * np.abs(change).max())
+    # a half sigma of the prior at most
+    assert np.linalg.norm(remainder(change, slopes)) <= 0.51
+    name = "4W2T.ground.friction.speed_static"  # slopes take the sds that they are given
+    wide = settled.base_slopes(GRID, p, show, (name,), {name: p[name]})
+    assert_allclose(wide, settled.base_slopes(GRID, p, show, (name,)) / 0.3, rtol=1e-6)
