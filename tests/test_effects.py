@@ -7,6 +7,7 @@ import functools
 import pickle
 import re
 from collections import Counter
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
+from worlds import laws
 
 from calibration.data.effect_file import readable_signals
 from calibration.discovery import menu
@@ -291,17 +293,6 @@ def law_absent_at_zero(effect):
     assert (terms(effect()) == 0).all()
 
 
-def law_alive_at_zero(effect):
-    """The derivative at zero is finite everywhere and not zero where the effect acts."""
-    there = TRANSIENT if effect.transient else ALL
-    values, slopes = at_zero(outputs_start if effect.transient else outputs_steady, there)
-    slopes = slopes[..., there.index(effect)]
-    assert np.isfinite(values).all() and np.isfinite(slopes).all()
-    count = len(channels.EVERY)  # the readings
-    moved = np.abs(slopes[:, :count]) * size(effect) / np.maximum(np.abs(values[:, :count]), 1e-9)
-    assert moved.max() > 1e-6, "dead gradient"
-
-
 def law_linear(effect):
     """The term is the amplitude times something that does not know the amplitude."""
     one = terms(fitted(effect, size(effect)))
@@ -484,10 +475,14 @@ def test_a_run_backward_is_read_as_one_forward_of_the_robot_turned_about(signed)
     ids=[e.name for e in ALL],
 )
 def test_effect_is_alive_at_zero(effect):
-    law_alive_at_zero(effect)
-
-
-# --- an effect of one's own ------------------------------------------------------------------------------
+    """The derivative at zero is finite everywhere and not zero where the effect acts."""
+    there = TRANSIENT if effect.transient else ALL
+    values, slopes = at_zero(outputs_start if effect.transient else outputs_steady, there)
+    slopes = slopes[..., there.index(effect)]
+    assert np.isfinite(values).all() and np.isfinite(slopes).all()
+    count = len(channels.EVERY)  # the readings
+    moved = np.abs(slopes[:, :count]) * size(effect) / np.maximum(np.abs(values[:, :count]), 1e-9)
+    assert moved.max() > 1e-6, "dead gradient"
 
 
 # --- the library is complete ----------------------------------------------------------------------------
@@ -513,21 +508,6 @@ def test_every_effect_is_pickled_as_stages_of_the_loop_are():
         assert pickle.loads(pickle.dumps(effect)) is effect
         for kind in (effect, scaled_effect(effect, (2.0, 1.0, 2.0))):
             assert type(pickle.loads(pickle.dumps(kind()))) is kind
-
-
-# --- imports --------------------------------------------------------------------------------------------
-
-FIRST = """
-import importlib, sys
-import diffrax, equinox, jax, optimistix
-count, *names = sys.argv[1:]
-for name in names:
-    for known in [n for n in sys.modules if n.partition(".")[0] == "mmrjax"]:
-        del sys.modules[known]
-    importlib.import_module(name)
-    from mmrjax.effects import ALL
-    assert len(ALL) == int(count)
-"""
 
 
 def test_units_of_signals_are_all_known():
@@ -560,52 +540,30 @@ def test_drive_feels_every_effect():
 # --- what single effects amount to ----------------------------------------------------------------------
 
 
-def _term(name, at=STATES, **values):
-    """The term of an effect in each of the states, plainly from its fields."""
-    return terms(params.replace(BY_NAME[name](), {k: jnp.asarray(float(v)) for k, v in values.items()}), signals=at)
+@pytest.mark.parametrize("name", [
+    "backdriving_loss", "directional_friction", "directional_stribeck", "presliding", "bristle_load_loss",
+    "bristle_backdriving_loss", "angle_friction", "position_friction",
+])  # fmt: skip
+def test_term_at_random_states_is_the_law_of_the_worlds(name):
+    """In both directions, at memories of both signs, and near rest."""
+    law, kind, shapes = (laws.TRANSIENT | laws.RIGS)[name], BY_NAME[name], {"speed_fade": 5.0, "phase": 0.5}
+    effect = kind(amplitude=0.2, **{n: x for n, x in shapes.items() if hasattr(kind, n)})
+    memory = STATES.side * STATES.memory.get(name, 0.0)
+    seen = SimpleNamespace(b=memory, turn=memory, B=STATES.torque_carried, d=STATES.direction, w_k=STATES.speed_wheel)
+    computed = terms(effect, signals=dataclasses.replace(STATES, memory={name: memory}))
+    assert_allclose(computed, 0.2 * law.of(seen, {"fade": 5.0, "phase": 0.5}), rtol=1e-12, atol=1e-15)
 
 
-def _travel(voltage, slope_deg=0.0, changes=None, gearbox=None, **amplitudes):
-    """Steady travel of both configurations under each voltage and slope, effects by their amplitudes."""
-    robot = params.replace(NOMINAL, changes or {})
-    robot = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, **(gearbox or {})))
-    present = tuple(fitted(BY_NAME[name], value) for name, value in amplitudes.items())
-    voltage, slope, configuration = (x.ravel() for x in np.meshgrid(voltage, slope_deg, [0, 1], indexing="ij"))
-    runs = Conditions(configuration, voltage, slope)
-    return runs, steady_batch(with_effects(*present, robot=robot), runs)
-
-
-def test_directional_friction_fades_at_rest_and_does_not_turn_round():
-    turning = np.asarray(STATES.direction)
-    assert_allclose(_term("directional_friction", amplitude=0.2), 0.2 * turning**2, rtol=1e-12)
-    assert (turning > 0.99).any() and (turning < -0.99).any() and (np.abs(turning) < 0.5).any()
-
-
-def test_backdriving_loss_is_a_share_of_a_load_that_drives():
-    load, turning = np.asarray(STATES.torque_carried), np.asarray(STATES.direction)
-    driven = load * turning < 0
-    assert 40 < driven.sum() < 360
-    expected = np.where(driven, 0.2 * np.abs(load) * np.abs(turning) * turning, 0.0)
-    assert_allclose(_term("backdriving_loss", amplitude=0.2), expected, rtol=1e-12, atol=1e-15)
-
-
-def test_stribeck_friction_by_direction_is_even_in_the_speed():
-    speed, way = np.asarray(STATES.speed_wheel), np.asarray(STATES.direction)
-    expected = 0.2 * np.exp(-np.abs(speed) / 5.0) * way**2
-    found = _term("directional_stribeck", amplitude=0.2, speed_fade=5.0)
-    assert_allclose(found, expected, rtol=1e-12)
-    assert (found[speed > 1] > 0.01).any() and (found[speed < -1] > 0.01).any()
-
-
-@pytest.mark.slow
-def test_backdriving_loss_can_be_the_theory_of_the_mesh():
-    down = dict(voltage=[24.0], slope_deg=[-20.0, -10.0], changes={"4W2T.ground.friction.static": 0.9})
-    _, stated = _travel(**down, backdriving_loss=1 - (2 - 1 / 0.74) / 0.74)
-    _, theory = _travel(**down, gearbox={"mesh_theory": True})
-    for name in ("total_current", "motor_speed", "speed"):  # on wheels
-        assert_allclose(getattr(stated, name)[1::2], getattr(theory, name)[1::2], rtol=1e-9)
-    _, without = _travel(**down)
-    assert (np.asarray(without.total_current) < np.asarray(stated.total_current) - 1e-3)[1::2].all()
+def test_bristles_bend_as_dahls_and_angles_are_integrals_of_speed():
+    """θ_s z' = ω_k - |ω_k| z (Dahl 1968). A settled bristle of `presliding` changes nothing."""
+    speed, way = STATES.speed_wheel, STATES.direction
+    bristles = ("presliding", "bristle_load_loss", "bristle_backdriving_loss")
+    rates = {name: speed * (1 - way * STATES.memory[name]) / 0.02 for name in bristles}
+    rates |= {"position_friction": speed, "angle_friction": STATES.speed_motor / NOMINAL.gearbox.ratio}
+    for name, rate in rates.items():
+        assert_allclose(jax.vmap(BY_NAME[name]().rate, (None, 0))(NOMINAL, STATES), rate, rtol=1e-12)
+    settled = fitted(BY_NAME["presliding"], 0.3)
+    assert (terms(settled, signals=dataclasses.replace(STATES, memory={})) == 0).all()
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5, 4.0])
@@ -618,55 +576,7 @@ def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
 
     slopes = jax.vmap(jax.grad(term, (0, 1, 2)), (0, None, None))
     speeds = jnp.asarray([-1e-3, -1e-12, 0.0, 1e-12, 1e-3, 1.0, 30.0])
-    found = np.stack(slopes(speeds, 8.0, exponent))
-    assert np.isfinite(found).all() and np.abs(found).max() < 20
-    less, more = (term(jnp.asarray(1.0 + s), 8.0, exponent) for s in (-1e-6, 1e-6))
-    assert_allclose(found[0, 5], (more - less) / 2e-6, rtol=1e-6)
-
-
-def _torque(name, memory, **signals):
-    at = Signals(memory={name: jnp.asarray(memory)}, **{k: jnp.asarray(float(v)) for k, v in signals.items()})
-    effect = fitted(BY_NAME[name], 0.3)
-    return float(effect.term(NOMINAL, at)), float(effect.rate(NOMINAL, at))
-
-
-def test_presliding_is_dahls_friction_in_place_of_coulombs():
-    """After a turn θ from rest z = 1 - e^(-θ/θ_s) (Dahl 1968). Once it turns back by θ, z = -1 + 2 e^(-θ/θ_s)."""
-    bent = 1 - np.exp(-0.03 / 0.02)
-    term, rate = _torque("presliding", bent, speed_wheel=4.0, direction=1.0)
-    assert term == pytest.approx(0.3 * (bent - 1)) and rate == pytest.approx(4.0 * np.exp(-1.5) / 0.02)
-    back = -1 + 2 * np.exp(-0.03 / 0.02)
-    term, rate = _torque("presliding", back, speed_wheel=-4.0, direction=-1.0)
-    assert term == pytest.approx(0.3 * (back + 1)) and rate == pytest.approx(-4.0 * 2 * np.exp(-1.5) / 0.02)
-    settled = fitted(BY_NAME["presliding"], 0.3)
-    assert (terms(settled, signals=dataclasses.replace(STATES, memory={})) == 0).all()
-
-
-@pytest.mark.parametrize("bend, way", [(0.4, 1.0), (-0.9, 1.0), (0.7, -1.0)])
-def test_load_lost_through_a_bristle_is_its_mean_and_its_difference(bend, way):
-    """μ_avg |τ| z + μ_dif τ z² with μ_avg = a + b/2 and μ_dif = -b/2, whichever way the load acts."""
-    average, difference = 0.12, -0.05
-    amplitudes = {"bristle_load_loss": average + difference, "bristle_backdriving_loss": -2 * difference}
-
-    def at(name, amplitude, **signals):
-        given = {k: jnp.asarray(v) for k, v in (signals | {"direction": way}).items()}
-        return fitted(BY_NAME[name], amplitude), Signals(memory={name: jnp.asarray(bend)}, **given)
-
-    for load in (1.5, -1.5):
-        made = [at(name, a, torque_carried=load) for name, a in amplitudes.items()]
-        lost = sum(float(effect.term(NOMINAL, signals)) for effect, signals in made)
-        assert lost == pytest.approx(average * abs(load) * bend + difference * load * bend**2)
-    effect, signals = at("bristle_load_loss", 1.0, speed_wheel=4 * way)
-    assert float(effect.rate(NOMINAL, signals)) == pytest.approx((4 * way - 4 * bend) / 0.02)
-
-
-def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
-    for way in (1.0, -1.0):
-        term, rate = _torque("position_friction", 2.5, speed_wheel=4.0 * way, direction=way)
-        assert (term, rate) == pytest.approx((0.3 * 2.5 * way, 4.0 * way))
-        term, rate = _torque("angle_friction", 2.5, speed_motor=4.0 * way, direction=way)
-        ratio = float(NOMINAL.gearbox.ratio)
-        assert (term, rate) == pytest.approx((0.3 * np.sin(2.5) * way, 4.0 * way / ratio))
+    assert np.abs(np.stack(slopes(speeds, 8.0, exponent))).max() < 20
 
 
 def test_friction_by_the_position_begins_where_a_history_does():
