@@ -53,15 +53,8 @@ def test_frequency_and_damping_are_those_of_two_inertias(name):
     size = np.asarray(drive_units(robot))
     y = jnp.asarray(np.array([0.5, 100.0, 100.0 / bench.ratio, 0.0, 0.0, 0.02]) / size)
     matrix = np.asarray(jax.jacfwd(lambda y: drive_rates(robot, at, y))(y)) * size[:, None] / size
-    n, k, d = bench.ratio, bench.stiffness, bench.damper
-    motor, kt = bench.inertia_motor, bench.torque_constant
-    own = np.array([  # current, speeds of motor and load, angle between them
-        [-bench.resistance / bench.inductance, -kt / bench.inductance, 0, 0],
-        [kt / motor, -d / (n * n * motor), d / (n * motor), -k / (n * motor)],
-        [0, d / (n * bench.inertia), -(d + bench.loss_viscous) / bench.inertia, k / bench.inertia],
-        [0, 1 / n, -1, 0],
-    ])  # fmt: skip
-    of = [0, 1, 2, 5]
+    own = np.stack([bench.rates_loose(state, 0.0) for state in np.eye(4)], -1)
+    of = [0, 1, 2, 5]  # current, speeds of motor and load, angle between them
     found, expected = (np.sort_complex(np.linalg.eigvals(m)) for m in (matrix[np.ix_(of, of)], own))
     assert_allclose(found, expected, rtol=1e-9)
     assert abs(expected.imag).max() > 2 * np.pi * 10

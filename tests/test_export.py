@@ -108,6 +108,19 @@ def plain():
     return compared(of_effects(dict.fromkeys(AMPLITUDES, 0.0)))
 
 
+def start_of(law):
+    """Parameters of a translated law before it is refitted."""
+    return dict(zip(law.names, map(float, law.start), strict=True))
+
+
+def mjcf(drive, motor, limit, mass, command, load):
+    """MJCF of a drive with a limit of its control, and of a scene."""
+    return {
+        "drive.xml": mujoco.mjcf_fragment(drive, motor, ABOUT, [], "motor", "drive", limit),
+        "scene.xml": mujoco.mjcf_scene(drive, mass, "motor", "drive", command, load),
+    }
+
+
 def translated(drive, runs):
     """Comparison with MuJoCo, its files and its numbers."""
     normal = float(np.mean(runs.signals.normal))
@@ -119,11 +132,7 @@ def translated(drive, runs):
         mujoco.approximated_terms,
     )
     motor = mujoco.mjcf_motor(drive, found.refitted)
-    files = {
-        "drive.xml": mujoco.mjcf_fragment(drive, motor, ABOUT, [], "motor", "drive", 33.0),
-        "scene.xml": mujoco.mjcf_scene(drive, 11.5, "motor", "drive", 24.0, 0.5),
-    }
-    return found, motor, files
+    return found, motor, mjcf(drive, motor, 33.0, 11.5, 24.0, 0.5)
 
 
 def apart(a, b):
@@ -206,8 +215,7 @@ def test_mujoco_runs_the_drive_as_the_native_model_over_table_8(plain):
     assert max(off(motor, files, rows)) < 1e-3
     assert found.translated == found.refitted  # exact already: no refit changes it
     wrong = replace(motor, values={**motor.values, mujoco.RESISTANCE: 0.9})
-    other = mujoco.mjcf_fragment(drive, wrong, ABOUT, [], "motor", "drive", 33.0)
-    assert off(wrong, {**files, "drive.xml": other}, rows[:2])[1] > 1e-3
+    assert off(wrong, mjcf(drive, wrong, 33.0, 11.5, 24.0, 0.5), rows[:2])[1] > 1e-3
 
 
 def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
@@ -232,9 +240,8 @@ def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
 def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
     drive, runs, known = with_effects
     law = actuator_law_function(runs, known)(drive, {})
-    current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
-    assert_allclose(current, runs.inside.current, rtol=1e-9)
-    assert_allclose(speed, runs.inside.speed, rtol=1e-9)
+    evaluated = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
+    assert_allclose(evaluated, [runs.inside.current, runs.inside.speed], rtol=1e-9)
     source = jax_source(drive, known)
     imported = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Import | ast.ImportFrom)]
     assert [ast.unparse(n) for n in imported] == ["import jax.numpy as jnp"]
@@ -320,12 +327,11 @@ def test_missing_onnx_library_names_the_extra(with_effects, monkeypatch):
 
 def stand_in(monkeypatch):
     """Modules named torch and mjlab with the interface that the exported file uses, on NumPy."""
-    torch = types.ModuleType("torch")
-    torch.clamp = lambda x, min=None, max=None: np.clip(x, min, max)
-    torch.full = lambda shape, value, device=None: np.full(shape, value)
-    torch.zeros = lambda shape, device=None: np.zeros(shape)
-    for name in ("where", "sign", "abs", "sqrt", "exp", "maximum", "minimum"):
-        setattr(torch, name, getattr(np, name))
+    names = ("where", "sign", "abs", "sqrt", "exp", "maximum", "minimum")
+    torch = types.SimpleNamespace(
+        clamp=lambda x, min=None, max=None: np.clip(x, min, max), full=lambda shape, x, device=None: np.full(shape, x),
+        zeros=lambda shape, device=None: np.zeros(shape), **{name: getattr(np, name) for name in names},
+    )  # fmt: skip
 
     class Actuator:
         def __init__(self, cfg, entity, target_ids, target_names):
@@ -341,13 +347,9 @@ def stand_in(monkeypatch):
     class ActuatorCfg:
         target_names_expr: tuple[str, ...]
 
-    base = types.ModuleType("mjlab.actuator.actuator")
-    base.Actuator, base.ActuatorCfg = Actuator, ActuatorCfg
-    for name, module in {
-        "torch": torch, "mjlab": types.ModuleType("mjlab"), "mjlab.actuator": types.ModuleType("mjlab.actuator"),
-        "mjlab.actuator.actuator": base,
-    }.items():  # fmt: skip
-        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    base = types.SimpleNamespace(Actuator=Actuator, ActuatorCfg=ActuatorCfg)
+    monkeypatch.setitem(sys.modules, "mjlab.actuator.actuator", base)
 
 
 def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, monkeypatch, tmp_path):
@@ -391,8 +393,7 @@ def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain):
     spread = np.array([[0.3, 0.0], [-0.24, 0.18]])
     posterior = posterior_of_coordinates(at, np.zeros(2), spread @ spread.T)
     normal = float(np.mean(runs.signals.normal))
-    law = mujoco.translate_law(drive, normal)
-    refitted = dict(zip(law.names, map(float, law.start), strict=True))
+    refitted = start_of(mujoco.translate_law(drive, normal))
     refitted[mujoco.RESISTANCE] *= 1.1  # as if a refit had found more
 
     def drawn(posterior):
@@ -451,12 +452,8 @@ def rig(tmp_path):
 def xml_of(file):
     """MJCF of a rig by translation alone."""
     drive = drive_of(file)
-    law = mujoco.translate_law(drive, 0.0)
-    motor = mujoco.mjcf_motor(drive, dict(zip(law.names, map(float, law.start), strict=True)))
-    return {
-        "drive.xml": mujoco.mjcf_fragment(drive, motor, ABOUT, [], "motor", "drive", 12.0),
-        "scene.xml": mujoco.mjcf_scene(drive, 0.0, "motor", "drive", 12.0, 0.1),
-    }
+    motor = mujoco.mjcf_motor(drive, start_of(mujoco.translate_law(drive, 0.0)))
+    return mjcf(drive, motor, 12.0, 0.0, 12.0, 0.1)
 
 
 def write_models(rig):
@@ -491,6 +488,20 @@ amplitude = 0.004
 """
 
 
+def driven_by_law(drive, command, resisting, step, count):
+    """Angle [rad], speed and current over Euler's steps of a simulator that calls the law in JAX. The first is at rest."""
+    module = law_of(drive)
+    inertia = float(drive.load.inertia + module.armature(module.PARAMS))
+
+    def advance(at, _):
+        state, angle, speed = at
+        torque, after, info = module.actuator(module.PARAMS, state, command, angle, speed, step)
+        speed = speed + step * (torque - resisting) / inertia
+        return (after, angle + step * speed, speed), (angle, speed, info["current"])
+
+    return jax.lax.scan(advance, (module.initial_state(), 0.0, 0.0), None, length=count)[1]
+
+
 @pytest.mark.parametrize("voltage, torque", [(12.0, 0.2), (2.0, -2.0)])
 def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, voltage, torque):
     """A start, and a load that drives the motor, in a simulator with Euler's steps.
@@ -500,22 +511,14 @@ def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, vol
     arm = RIG.split("[effects")[0].replace("torque_gravity = 0.6", f"torque_constant = {torque}")
     rig.write_text(arm + LOSSES)
     drive = drive_of(rig)
-    module = law_of(drive)
-    step, inertia = 2e-5, float(drive.load.inertia + module.armature(module.PARAMS))
-
-    def advance(at, _):
-        state, speed = at
-        made, state, info = module.actuator(module.PARAMS, state, voltage, 0.0, speed, step)
-        speed = speed + step * (made - torque) / inertia
-        return (state, speed), (speed, info["current"])
-
-    found = jax.lax.scan(advance, (module.initial_state(), 0.0), None, length=5000)[1]
+    step = 2e-5
+    _, *simulated = driven_by_law(drive, voltage, torque, step, 5000)
     robot = find_robot_file(str(rig)).robot
     run = mm.simulate(robot, mm.Conditions(voltage=voltage), model="drive", duration=0.1, history=True).history
     time, reading = run.time, run.reading
     # a step is a tenth of the winding's L/R
     for mine, native, begins in zip(
-        found, (reading["motor_speed"] / 19.7, reading["total_current"]), (0.0, 2e-3), strict=True
+        simulated, (reading["motor_speed"] / 19.7, reading["total_current"]), (0.0, 2e-3), strict=True
     ):
         error = np.interp(time, step * np.arange(1, 5001), mine) - native
         assert np.abs(error[time > begins]).max() < 1e-3 * np.abs(native).max()
@@ -677,17 +680,7 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
     if in_mujoco is not None:
         angles = mujoco.angles_in_mujoco(xml_of(rig), command * (200 if goal else 1), times, 1e-4)
         assert np.abs(angles - native).max() < in_mujoco
-    module = law_of(drive)
-    inertia, step = float(drive.load.inertia) + float(module.armature(module.PARAMS)), 5e-5
-    resisting = float(drive.load.torque_constant)
-
-    def advance(at, _):
-        state, speed, angle = at
-        torque, state, _ = module.actuator(module.PARAMS, state, command, angle, speed, step)
-        speed = speed + step * (torque - resisting) / inertia
-        return (state, speed, angle + step * speed), angle
-
-    angles = jax.lax.scan(advance, (module.initial_state(), 0.0, 0.0), None, length=10_001)[1]
+    angles, *_ = driven_by_law(drive, command, float(drive.load.torque_constant), 5e-5, 10_001)
     assert np.abs(angles[::400] - native).max() < in_jax
 
 

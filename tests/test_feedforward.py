@@ -7,6 +7,7 @@ import pytest
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from pages import drawn
+from scipy.optimize import approx_fprime
 
 from calibration.data import runs as records
 from calibration.described import sentences
@@ -36,14 +37,14 @@ def simulated(seed, fault="", tests=TESTS, kG=0.0, arm=False):
             past = [*past[-4:], v]
             for _ in range(FINE):
                 supply = 12.5 - 0.4 * abs(u - kV * v) if fault == "sag" else 12.5
-                half = v
+                middle = v
                 for part in (dt / 2, dt):  # the midpoint rule
-                    asked = u * supply / 12.5 - kV * half - kG * (np.cos(np.pi / 180 * x) if arm else 1)
-                    net = asked - kS * np.sign(v) if v else np.sign(asked) * max(abs(asked) - kS, 0)
-                    net = np.clip(net, -3.0, 3.0) if fault == "limit" else net
-                    net += 1.5 * np.sign(net) * max(abs(net) - 3.0, 0) if fault == "skid" else 0.0
-                    half, before = v + net / kA * part, half
-                x, v = x + before * dt, half
+                    net = u * supply / 12.5 - kV * middle - kG * (np.cos(np.pi / 180 * x) if arm else 1)
+                    net -= kS * np.sign(v) if v else np.clip(net, -kS, kS)
+                    beyond = net - np.clip(net, -3.0, 3.0)
+                    net += {"limit": -1.0, "skid": 1.5}.get(fault, 0.0) * beyond
+                    middle, before = v + net / kA * part, middle
+                x, v = x + before * dt, middle
                 places, speeds = [*places[1:], x], [*speeds[1:], v]
             rows.append([test, k * STEP, -u if fault == "sign" else u, *reading, supply])
     *columns, battery = map(np.array, zip(*rows, strict=True))
@@ -52,19 +53,16 @@ def simulated(seed, fault="", tests=TESTS, kG=0.0, arm=False):
 
 def least_squares(log):
     """Next speed on speed, voltage and direction: the exact law of a held voltage. Returns constants and sds."""
-    rows = []
-    for name in TESTS:
-        v, u = log.velocity[log.run == name], log.voltage[log.run == name]
-        moves = np.flatnonzero((np.abs(v[:-1]) > 1.0) & (np.abs(v[1:]) > 1.0))
-        rows += [(v[k + 1], v[k], u[k], np.sign(v[k])) for k in moves]
-    y, x = np.array(rows)[:, 0], np.array(rows)[:, 1:]
+    v, following = log.velocity[:-1], log.velocity[1:]
+    moves = (log.run[:-1] == log.run[1:]) & (np.abs(v) > 1.0) & (np.abs(following) > 1.0)
+    y, x = following[moves], np.stack([v, log.voltage[:-1], np.sign(v)], -1)[moves]
     solved, cost, *_ = np.linalg.lstsq(x, y, rcond=None)
 
     def constants(b):
         kV = (1 - b[0]) / b[1]
         return np.array([-b[2] / b[1], kV, -kV * STEP / np.log(b[0])])
 
-    jacobian = np.array([(constants(solved + d) - constants(solved - d)) / 2e-7 for d in 1e-7 * np.eye(3)]).T
+    jacobian = approx_fprime(solved, constants, 1e-7)
     spread = cost / (len(y) - 3) * np.linalg.inv(x.T @ x)
     return constants(solved), np.sqrt(np.diag(jacobian @ spread @ jacobian.T))
 

@@ -29,60 +29,63 @@ def written(tmp_path, kind, columns):
     return read_rig(tmp_path, rig_new.rig_template(kind).replace(EXAMPLE, "measured"))
 
 
-def sampled(rng, speed, angle, imposed, rate, delay, step, jitter=0.1):
-    """Clock, what is imposed and the angle, as a logger sees them: late by `delay`, rounded to `step`."""
+def sampled(rng, angle, imposed, rate, step):
+    """Clock, what is imposed and the angle, as a logger sees them: at uneven times, rounded to `step`."""
     times = np.arange(0, len(angle) * STEP, 1 / rate)
-    times[1:] += jitter / rate * np.clip(rng.standard_normal(len(times) - 1), -3, 3)
+    times[1:] += 0.1 / rate * np.clip(rng.standard_normal(len(times) - 1), -3, 3)
     at = np.minimum((times / STEP).astype(int), len(angle) - 1)
-    shown = angle[np.maximum(at - round(delay / STEP), 0)]
-    return times, imposed[at], np.round(shown / step) * step
+    return times, imposed[at], np.round(angle[at] / step) * step
+
+
+def turned(imposed, inertia, torque):
+    """Angle by explicit steps. `torque`: function of what is imposed, speed and its smoothed sign."""
+    speed, angle = np.zeros((2, len(imposed)))
+    for n in range(1, len(imposed)):
+        last = speed[n - 1]
+        sense = np.tanh(last / 0.01) if abs(last) > 1e-6 else np.sign(imposed[n])
+        speed[n] = last + STEP * torque(imposed[n], last, sense) / inertia
+        angle[n] = angle[n - 1] + STEP * speed[n]
+    return angle
+
+
+#: Supply [V], resistance, torque constant, friction of the motor, ratio, efficiency, viscous loss of the servo's template.
+SERVO = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005
+#: Metres per radian of the carriage's screw, its dry [N] and viscous friction [N·s/m].
+RADIUS, DRY, VISCOUS = 5e-3 / (2 * np.pi), 12.0, 400.0
 
 
 def servo(rng, levels=(0.4, 0.7, 1.0, -0.6, -0.9), hold=1.2, dry=0.05):
     """U d = k ω_m + R I, J dω/dt = i η (k I - M_f) - M_0 - K ω, of the template's numbers, angle in degrees."""
-    volts, r, k, friction, ratio, eta, viscous = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005
-    inertia = 0.0005 + eta * 1e-7 * ratio**2
+    volts, r, k, friction, ratio, eta, viscous = SERVO
     duty = np.repeat(levels, round(hold / STEP))
-    speed, angle = np.zeros(len(duty)), np.zeros(len(duty))
-    for n in range(1, len(duty)):
-        w = speed[n - 1]
-        sense = np.tanh(w / 0.01) if abs(w) > 1e-6 else np.sign(duty[n])
-        torque = (
-            ratio * eta * (k * (volts * duty[n] - k * ratio * w) / r - friction * sense) - dry * sense - viscous * w
-        )
-        speed[n] = w + STEP * torque / inertia
-        angle[n] = angle[n - 1] + STEP * speed[n]
-    times, imposed, shown = sampled(rng, speed, np.degrees(angle), duty, 100.0, 0.0, 360 / 4096)
-    return {
-        "time_s": times,
-        "supply_voltage_V": np.full(len(times), volts),
-        "duty": imposed,
-        "output_angle_deg": shown,
-    }
+
+    def torque(duty, speed, sense):
+        driving = k * (volts * duty - k * ratio * speed) / r - friction * sense
+        return ratio * eta * driving - dry * sense - viscous * speed
+
+    angle = turned(duty, 0.0005 + eta * 1e-7 * ratio**2, torque)
+    times, imposed, shown = sampled(rng, np.degrees(angle), duty, 100.0, 360 / 4096)
+    return {"time_s": times, VOLTS: np.full(len(times), volts), "duty": imposed, "output_angle_deg": shown}
 
 
 def carriage(rng, levels=(1.2, 1.6, 2.0, -1.4, -1.8), hold=1.5):
     """m x'' = i k / r - F_0 - b x', of the template's numbers with more that rises with speed, position in mm."""
-    k, friction, mass, radius, dry, viscous = 0.05, 0.004, 2.5, 5e-3 / (2 * np.pi), 12.0, 400.0
-    inertia = mass * radius**2 + 1e-5
     current = np.repeat(levels, round(hold / STEP))
-    speed, place = np.zeros(len(current)), np.zeros(len(current))
-    for n in range(1, len(current)):
-        w = speed[n - 1]
-        sense = np.tanh(w / 0.01) if abs(w) > 1e-6 else np.sign(current[n])
-        torque = k * current[n] - (friction + dry * radius) * sense - viscous * radius**2 * w
-        speed[n] = w + STEP * torque / inertia
-        place[n] = place[n - 1] + STEP * speed[n] * radius
-    times, imposed, shown = sampled(rng, speed, 1e3 * place, current, 200.0, 0.0, 0.005)
+
+    def torque(current, speed, sense):
+        return 0.05 * current - (0.004 + DRY * RADIUS) * sense - VISCOUS * RADIUS**2 * speed
+
+    angle = turned(current, 2.5 * RADIUS**2 + 1e-5, torque)
+    times, imposed, shown = sampled(rng, 1e3 * RADIUS * angle, current, 200.0, 0.005)
     return {"time_s": times, "motor_current_A": imposed, "position_mm": shown}
 
 
 def test_a_servos_log_of_pwm_and_angle_settles(tmp_path):
     robot = written(tmp_path, "servo", servo(default_rng(1)))
     found = settle_log(read_runs(tmp_path / "log.csv", robot=robot))
-    volts, r, k, friction, ratio, eta, viscous, dry = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005, 0.05
+    volts, r, k, friction, ratio, eta, viscous = SERVO
     duty = np.array([0.4, 0.7, 1.0, -0.6, -0.9])
-    torque = ratio * eta * (k * volts * np.abs(duty) / r - friction) - dry
+    torque = ratio * eta * (k * volts * np.abs(duty) / r - friction) - 0.05
     exact = np.sign(duty) * torque / (viscous + ratio * eta * k * k * ratio / r) * 30 / np.pi
     shown, sd = np.array([(s.mean["output_speed"], s.sd["output_speed"]) for s in found.kept]).T
     assert shown == pytest.approx(exact, rel=5e-3) and np.abs((shown - exact) / sd).max() < 5
@@ -92,9 +95,8 @@ def test_a_servos_log_of_pwm_and_angle_settles(tmp_path):
 def test_a_carriages_log_of_current_and_position_settles(tmp_path):
     robot = written(tmp_path, "carriage", carriage(default_rng(2)))
     found = settle_log(read_runs(tmp_path / "log.csv", robot=robot))
-    radius = 5e-3 / (2 * np.pi)
     current = np.array([1.2, 1.6, 2.0, -1.4, -1.8])
-    exact = np.sign(current) * (0.05 * np.abs(current) - 0.004 - 12.0 * radius) / (400.0 * radius**2) * radius * 1e3
+    exact = np.sign(current) * (0.05 * np.abs(current) - 0.004 - DRY * RADIUS) / (VISCOUS * RADIUS) * 1e3
     assert [s.mean["speed"] for s in found.kept] == pytest.approx(exact, rel=5e-3)
     assert found.table()["motor_current_A"] == pytest.approx(current)
 
@@ -106,7 +108,7 @@ def test_a_carriages_log_of_current_and_position_settles(tmp_path):
 def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_path, kind, make, column, least):
     robot = written(tmp_path, kind, make(default_rng(3), hold=0.4))
     if kind == "carriage":
-        robot = change_robot(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
+        robot = change_robot(robot, {"carriage.loss_viscous": VISCOUS * RADIUS**2}, "a test")
     runs = read_runs(tmp_path / "log.csv", robot=robot)
     ready = prepare_input(runs, robot)
     shown = points.simulate_histories(ready.robot, runs, None)
