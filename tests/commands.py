@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
+from mmrjax.model.params import walk_parameters
 from sweeps import cli
 
 #: The checkout.
@@ -57,6 +59,31 @@ def refused(says, error=BadData):
     with pytest.raises(error, match=says) as refusal:
         yield
     assert "\n" not in str(refusal.value)
+
+
+class Hangs(BaseException):
+    """A command or a reader has not answered."""
+
+
+@contextlib.contextmanager
+def alarmed(seconds=60):
+    """Raises `Hangs` after so many seconds of wall-clock time."""
+
+    def hang(*_):
+        raise Hangs
+
+    handler = signal.signal(signal.SIGALRM, hang)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, handler)
+
+
+def parameter_values(robot):
+    """Every parameter of a robot by its name."""
+    return {p.name: float(p.value) for p in walk_parameters(robot)}
 
 
 def text_file(path, text):

@@ -6,7 +6,6 @@ Mutations of valid files are drawn from a seeded generator. One that is still a 
 import contextlib
 import re
 import shutil
-import signal
 import time
 
 import numpy as np
@@ -21,17 +20,13 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.priors import parameter_coordinates
 from mmrjax.model import paper_robots
-from tests.commands import ROOT
+from tests.commands import ROOT, alarmed
 
 pytestmark = pytest.mark.slow
 
-#: Longest answer [characters], and most processor time that it takes [s]; wall-clock time after which it hangs [s].
-SENTENCE, SECONDS, HANGS = 400, 20.0, 60
+#: Longest answer [characters], and most processor time that it takes [s].
+SENTENCE, SECONDS = 400, 20.0
 CODES = (2, 3, 4)
-
-
-class Hangs(BaseException):
-    """A command has not answered."""
 
 
 @pytest.fixture(scope="module")
@@ -168,22 +163,6 @@ HEAVY = (
     "sweeps.commands.loop.discover", "sweeps.commands.calibrate.fit_robot", "sweeps.commands.sensitivity.analyse_sensitivity",
     "sweeps.commands.size.search_designs", "mmrjax.undercarriage.rendering.render",
 )  # fmt: skip
-
-
-@contextlib.contextmanager
-def alarmed():
-    """The limit of an answer's time."""
-
-    def hang(*_):
-        raise Hangs
-
-    handler = signal.signal(signal.SIGALRM, hang)
-    signal.alarm(HANGS)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, handler)
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import io
 import json
 import os
 import resource
-import signal
 import struct
 import time
 import zipfile
@@ -33,10 +32,10 @@ from calibration.data.input_errors import InputError
 from calibration.data.runs import read_runs
 from mmrjax.errors import LONGEST
 from sweeps.commands.rig_new import joint_numbers, new_rig_text
-from tests.commands import text_file
+from tests.commands import Hangs, alarmed, text_file
 
-#: Most processor time of one answer [s], wall-clock time after which it hangs [s], and memory that it may take [bytes].
-SECONDS, HANGS, MEMORY = 5.0, 60, 2**31
+#: Most processor time of one answer [s], and memory that it may take [bytes].
+SECONDS, MEMORY = 5.0, 2**31
 #: Mutations of each file.
 EACH = 16
 
@@ -46,29 +45,18 @@ def robot(tmp_path_factory):
     return robot_file.read_robot(text_file(tmp_path_factory.mktemp("rig") / "rig.toml", RIG))
 
 
-class Hangs(BaseException):
-    """A reader has not answered."""
-
-
 @contextlib.contextmanager
 def bounded():
     """Limits of time and memory around one answer."""
-
-    def hang(*_):
-        raise Hangs
-
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as stream:
         used = int(stream.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    handler = signal.signal(signal.SIGALRM, hang)
-    signal.alarm(HANGS)
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, handler)
+    with alarmed():
+        resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def asked(*questions):

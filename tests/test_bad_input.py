@@ -52,13 +52,13 @@ def written(path, runs):
 
 
 @pytest.mark.slow
-def test_histories_that_grip_have_nothing_said(histories):
+def test_histories_that_grip_have_no_notes(histories):
     assert conduct_notes(histories, CLIMBING) == []
     assert conduct_notes(table(tables.narrow(seed=3)), CLIMBING) == []
 
 
 @pytest.mark.slow
-def test_histories_that_never_grip_are_said(sliding, histories):
+def test_histories_that_never_grip_are_reported(sliding, histories):
     which, none = conduct_notes(sliding, CLIMBING)
     assert (
         which == Remark("never_grips", runs=RUNS, share=which.share)
@@ -71,7 +71,7 @@ def test_histories_that_never_grip_are_said(sliding, histories):
     assert said == Remark("never_grips", runs=("start0",), share=said.share)
 
 
-def test_runs_of_ten_milliseconds_are_said(short):
+def test_runs_of_ten_milliseconds_are_reported(short):
     (said,) = conduct_notes(short, CLIMBING)
     assert said.code == "ends_early" and said.runs == RUNS
     assert said.lasts == pytest.approx(0.01, rel=0.1) and 0 < said.share < 0.7

@@ -109,7 +109,7 @@ def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_pa
     assert_allclose(float(table[3]["after_speed_mm_s"]), 1e3 * found.readings["speed"].after[3], rtol=1e-8)
 
 
-def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, capsys):
+def test_blocks_equal_to_other_blocks_are_reported_and_not_shown(found, capsys):
     """Three identical rows of the table were once printed without a word."""
     reading = {name: r.after for name, r in found.readings.items()}
     other = {name: r.after + 0.02 * r.sd for name, r in found.readings.items()}
@@ -161,7 +161,7 @@ def test_a_configuration_without_rows_is_refused_where_named_and_left_out_where_
 
 
 @pytest.mark.parametrize("stated, apart", [(None, "40%"), (STATED, "14 sd")])
-def test_repeats_that_differ_are_said_and_no_error(measured, stated, apart):
+def test_repeats_that_differ_are_reported_without_an_error(measured, stated, apart):
     other = repeated(measured, 5.2)
     (note,) = SettledRuns.check(other, noise_of(other, stated))
     assert note == Remark(
@@ -199,7 +199,7 @@ def test_thousands_of_rows_are_compared_at_once(measured):
 
 
 @pytest.mark.slow
-def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
+def test_a_parameter_that_no_reading_determines_is_reported_with_readings_that_would(measured):
     made = quick(measured, free=["default", "motor.inductance", "6T2A.mass"])
     assert {Remark("unmeasured", name=name) for name in ("motor.inductance", "6T2A.mass")} <= {*made.remarks}
     entry = made.parameters["motor.inductance"]

@@ -91,13 +91,13 @@ def test_track_calibration_recovers_the_guide_friction(found, made, told):
 
 
 @pytest.mark.slow
-def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
+def test_calibrated_robot_gives_the_same_readings_in_other_fidelities(found, made):
     current = steady_batch(found.robot, made.conditions(found.robot)).total_current
     assert_allclose(current, made["total_current_A"], rtol=5e-3)
 
 
 @pytest.mark.slow
-def test_a_belt_too_stiff_for_the_step_is_said(base, made):
+def test_a_belt_too_stiff_for_the_step_is_reported(base, made):
     """Friction and contacts are implicit in a step, the springs of the belt are not."""
     stiff = params.replace(base, {"running_gear.span_stiffness": 1e8})
     (said,) = fidelities.get_fidelity("track").cautions(stiff, made.conditions(stiff))

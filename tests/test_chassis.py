@@ -7,11 +7,11 @@ from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 from worlds import paper
 
-from mmrjax.model import params
 from mmrjax.model.balances import begin_signals, moving_signals
 from mmrjax.model.chassis import inertia_reduced, normal_load
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
+from tests.commands import parameter_values
 
 RNG = default_rng(31)
 
@@ -58,6 +58,6 @@ def test_total_mass_stated_overrides_robot_and_payload(robot):
 
 
 def test_masses_are_table7(robot):
-    values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
+    values = parameter_values(robot)
     assert (values["6T2A.mass"], values["4W2T.mass"]) == (13.1, 11.5)
     assert values["motor.inertia"] > 5760e-6 / 48**2  # [kg·m²]; the rotor of the sheet has 3.35e-6

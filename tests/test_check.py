@@ -72,7 +72,7 @@ def row(result, name, k=0):
 
 
 @pytest.mark.slow
-def test_result_is_as_its_schema_says(result):
+def test_result_of_check_obeys_its_schema(result):
     jsonschema.validate(result, SCHEMA)
     assert result["met"] + result["missed"] == len(result["requirements"]) and result["missed"] > 0
 

@@ -18,11 +18,12 @@ from calibration.discovery import candidates, loop_input, scales
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
+from calibration.inference.linearization import amplitude_of
 from mmrjax.compile.compiling import compiled, for_equations
 from mmrjax.effects import BY_NAME
 from mmrjax.effects.base import scaled_effect
 from mmrjax.fidelities.steady import steady
-from mmrjax.model import paper_robots, params
+from mmrjax.model import paper_robots
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Instrument, Rig
 
@@ -49,12 +50,12 @@ def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):
     seen = [for_equations((s.equipped, s.bare, s.library.scored)) for s in spaces]
     assert jax.tree.structure(seen[0]) == jax.tree.structure(seen[1])
     assert [x.shape for x in jax.tree.leaves(seen[0])] == [x.shape for x in jax.tree.leaves(seen[1])]
-    sizes = [[float(effects_sd(e)) for e in s.library.effects] for s in spaces]
+    sizes = [[float(prior_sd(e)) for e in s.library.effects] for s in spaces]
     assert not np.allclose(*sizes)  # while effects are of another size in each
 
 
-def effects_sd(effect):
-    return next(p.spec.prior_sd(0.0) for p in params.walk_parameters(effect) if p.spec.amplitude)
+def prior_sd(effect):
+    return amplitude_of(effect).spec.prior_sd(0.0)
 
 
 @pytest.mark.slow
@@ -85,7 +86,7 @@ def test_an_effect_of_another_size_is_the_same_to_equations():
     kind = BY_NAME["churning"]
     wide = scaled_effect(kind, (3.0, 1.0, 3.0))
     one = wide(amplitude=jnp.asarray(2e-4))
-    assert effects_sd(one) == pytest.approx(3 * effects_sd(kind()))
+    assert prior_sd(one) == pytest.approx(3 * prior_sd(kind()))
     plain = for_equations(one)
     assert type(plain) is kind and float(plain.amplitude) == 2e-4 and for_equations(plain) is plain
 

@@ -19,7 +19,7 @@ from calibration.inference.observers.time_histories import Histories
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import history_signals, time_grid
 from mmrjax.model import params
-from tests.commands import read_rig
+from tests.commands import parameter_values, read_rig
 
 SMOOTH = {**servo.TRUE, "coulomb": 0.0, "ki": 50.0}
 
@@ -129,7 +129,7 @@ def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, rate):
     if rate:
         values = {**SLOWER, "coulomb": 0.0}  # the moment at which friction yields is one of a step
         robot, onward = actuator(values, "kp = ", SAMPLED[True]), (WAVES[0], 0.8 + WAVES[0])
-    value = {p.name: float(p.value) for p in params.walk_parameters(robot)}
+    value = parameter_values(robot)
     at = jnp.array([value[name] for name in names])
 
     @jax.jit

@@ -19,6 +19,7 @@ from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, SLIDES, STALLED, STATUSES
+from tests.commands import parameter_values
 
 NAMES = ("motor.resistance", "motor.torque_constant", "6T2A.ground.friction.static", "6T2A.ground.rolling_resistance")
 
@@ -32,12 +33,9 @@ def changed(robot, **values):
     return params.replace(robot, {k.replace("__", "."): jnp.asarray(v) for k, v in values.items()})
 
 
-def value(robot, name):
-    return float(next(p.value for p in params.walk_parameters(robot) if p.name == name))
-
-
 def function(robot, conditions, compute):
-    theta = jnp.asarray([value(robot, n) for n in NAMES])
+    values = parameter_values(robot)
+    theta = jnp.asarray([values[n] for n in NAMES])
     return theta, jax.jit(lambda t: compute(params.replace(robot, dict(zip(NAMES, t, strict=True))), conditions))
 
 

@@ -11,6 +11,7 @@ from calibration.data.runs import Runs, read_runs
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.scales import goes_both_ways, has_partial_duty, visible_effects
 from calibration.discovery.settings import settings_for
+from calibration.inference.linearization import amplitude_of
 from calibration.inference.observers import Histories, SettledRuns
 from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME
@@ -128,4 +129,4 @@ def test_loop_takes_friction_of_one_direction_for_dry_friction():
 
 
 def _sd(name):
-    return next(p for p in params.walk_parameters(BY_NAME[name]()) if p.spec.amplitude).spec.prior_sd(0.0)
+    return amplitude_of(BY_NAME[name]()).spec.prior_sd(0.0)

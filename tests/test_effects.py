@@ -20,7 +20,7 @@ from worlds import laws
 
 from calibration.data.effect_file import readable_signals
 from calibration.discovery import menu
-from calibration.inference.linearization import PROBED
+from calibration.inference.linearization import PROBED, amplitude_of
 from calibration.inference.observers.settled import SettledRuns
 from mmrjax import effects
 from mmrjax.effects import ALL, BY_NAME, base
@@ -149,8 +149,7 @@ STATES = random_states()
 
 
 def size(effect):
-    spec = next(p for p in params.walk_parameters(effect()) if p.name == "amplitude").spec
-    return spec.prior_sd(0.0)
+    return amplitude_of(effect()).spec.prior_sd(0.0)
 
 
 def fitted(effect, amplitude):

@@ -31,7 +31,6 @@ from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax import effects
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model import balances, paper_robots
-from mmrjax.model.params import walk_parameters
 from mmrjax.model.signals import Signals
 from sweeps.commands.rig_new import joint_numbers, new_rig_text, rig_template
 from sweeps.export import comparison, mujoco
@@ -64,7 +63,7 @@ from sweeps.export.law_source import (
     module_from_source,
     torch_source,
 )
-from tests.commands import ROOT, ends, read_json
+from tests.commands import ROOT, ends, parameter_values, read_json
 
 WHEELS, TRACKS = "4W2T", "6T2A"
 #: Comments of a model's constants.
@@ -531,11 +530,7 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     assert lines[0] == lines[1]
     elsewhere = ("battery", "running_gear", "motor.resistance_thermal", "motor.time", "rig")
     before, after = (
-        {
-            p.name: float(p.value)
-            for p in walk_parameters(find_robot_file(str(f)).robot)
-            if not p.name.startswith(elsewhere)
-        }
+        {n: x for n, x in parameter_values(find_robot_file(str(f)).robot).items() if not n.startswith(elsewhere)}
         for f in (rig, again)
     )
     assert {name: after[name] for name in before} == pytest.approx(before, rel=1e-8)

@@ -43,7 +43,7 @@ def nothing(verdict="none"):
         (of_mechanism(DROP), (), "mechanism", ((DROP,),)),
     ],
 )
-def test_it_is_the_deepest_claim_that_all_verdicts_hold(own, others, level, claims):
+def test_headline_is_the_deepest_claim_that_all_verdicts_share(own, others, level, claims):
     found = headline(own, list(zip((0.7, 1.4), others, strict=False)))
     assert (found.level, found.claims) == (level, claims)
     assert found.factors == tuple(sorted((1.0, *(0.7, 1.4)[: len(others)])))

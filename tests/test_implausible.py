@@ -74,7 +74,7 @@ def test_heating_of_a_plausible_size_is_named():
     assert found.verdict == "named" and found.members == (("winding_heating",),)
 
 
-def test_heating_three_times_too_large_is_unnamed_and_said(hot):
+def test_heating_three_times_too_large_is_ruled_out_by_its_size(hot):
     support = hot.standing
     assert hot.verdict in WITHOUT_NAME and hot.members == ()
     assert "winding_heating" in support.effects or all(t.larger == ("winding_heating",) for t in support.tests)

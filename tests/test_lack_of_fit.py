@@ -112,7 +112,7 @@ def test_replicates_tell_what_the_noise_is():
     assert judged(clean, estimated=True).adequate
 
 
-def test_too_few_rows_cannot_be_tested_and_say_so():
+def test_adequacy_of_too_few_rows_is_unknown():
     whole, few = toy(default_rng(6), parameters=2), np.arange(0, 90, 30)
     rows = (few[:, None] * 3 + np.arange(3)).ravel()
     some = {name: getattr(whole, name)[few] for name in ("simulated", "whitened", "counts")}
@@ -150,12 +150,12 @@ def test_no_test_of_residuals_decides_before_the_fit_is_one(
 
 
 @pytest.mark.parametrize("noise", [10.0, 0.5])
-def test_noise_that_is_off_everywhere_alike_is_said_with_its_factor(noise):
+def test_wrong_sds_of_all_channels_are_reported_with_one_factor(noise):
     (off,) = noise_remarks(toy(default_rng(7), noise=noise))
     assert off.channel == "" and off.factor == pytest.approx(noise, rel=0.2) and off.source == "stated"
 
 
-def test_noise_of_one_channel_that_is_off_is_said_of_that_channel():
+def test_wrong_sd_of_one_channel_is_reported_for_that_channel():
     made = toy(default_rng(8))
     whitened, jacobian = made.whitened.copy(), made.jacobian.reshape(90, 3, -1).copy()
     whitened[:, 2] *= 3
@@ -164,7 +164,7 @@ def test_noise_of_one_channel_that_is_off_is_said_of_that_channel():
     assert off.channel == "speed" and off.factor == pytest.approx(3.0, rel=0.1)
 
 
-def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():
+def test_right_sds_and_structured_residuals_have_no_remark_on_sds():
     assert noise_remarks(toy(default_rng(9))) == []
     assert noise_factors(toy(default_rng(10), missing=4.0)) == {}
 

@@ -21,10 +21,9 @@ from worlds import histories, settled, tables
 from calibration.data import effect_file, robot_file
 from calibration.inference import bases as curves
 from mmrjax.effects import BY_NAME
-from mmrjax.model import params
 from sweeps import cli
 from sweeps.commands import loop as room
-from tests.commands import ROOT, csv_text, read_json, rows, schema_of, text_file
+from tests.commands import ROOT, csv_text, parameter_values, read_json, rows, schema_of, text_file
 
 SCHEMA = schema_of("loop")
 PRIORS = [a for c in ("6T2A", "4W2T") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")]
@@ -130,7 +129,7 @@ def quick():
 # --- what it leaves ----------------------------------------------------------------------------------
 
 
-def test_command_ends_well_and_says_what_it_found(done):
+def test_loop_command_prints_its_answer_and_leaves_its_files(done):
     assert done.answer.code == 0
     lines = done.answer.out.rstrip().splitlines()
     assert lines[-1] == "found" and lines[0].startswith("No: a loss torque")
@@ -148,7 +147,7 @@ def test_what_is_written_predicts_and_the_refit_stands_beside_it(done):
     assert said["written"] == "found" and said["gain"] > said["se"] > 0
     refit, found = (robot_file.load_robot(done.folder / "found" / f"{name}.toml") for name in ("fitted", "robot"))
     assert not refit.effects and [e.name for e in found.effects] == [done.result["effects"][0]["name"]]
-    values = {p.name: float(p.value) for p in params.walk_parameters(refit)}
+    values = parameter_values(refit)
     for name, shift in done.result["base_shift"].items():
         if shift["unit"] == "-":
             assert values[name] == pytest.approx(shift["before"], rel=1e-6)
@@ -191,7 +190,7 @@ def test_result_has_the_schema_of_the_issue(done):
     assert not re.search(r"\bNaN\b|Infinity", (done.folder / "found/result.json").read_text())
 
 
-def test_copies_count_once_and_are_said(done):
+def test_copied_rows_count_once_and_a_note_reports_them(done):
     assert done.result["rows"] == done.result["rows_used"] == 24
     assert any("row 25 is an exact copy" in note for note in done.result["notes"])
 

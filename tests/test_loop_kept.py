@@ -119,7 +119,7 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     ends(mmrjax(*rig, "--within", "5min"), "as far as this test goes")
 
 
-def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_path):
+def test_a_stage_that_cannot_be_saved_is_not_reported_as_saved(rig, mmrjax, monkeypatch, tmp_path):
     def first(*_, keep, **__):
         keep("verdict", lambda: SimpleNamespace(verdict="none", own=lambda: None))  # which no file takes
         raise KeyboardInterrupt

@@ -246,7 +246,7 @@ def lines_of(found, capsys):
 
 
 @pytest.mark.parametrize("name", TOLD)
-def test_a_result_is_told_as_recorded(shown, capsys, name):
+def test_text_of_each_result_is_as_recorded(shown, capsys, name):
     """What differs from the result as it is found is kept. The words are the same, the numbers to a hundredth."""
     found = shown("churning", capsys).found
     usual = [] if name == "as_found" else lines_of(found, capsys)

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from worlds.events import Bench
 
 from calibration.described import describe
 from calibration.discovery import discover, stages, verdict
@@ -36,6 +37,16 @@ loss_coulomb = "0.02 ± 50 %"
 STEP, RATIO = 2e-3, 210.0
 
 
+def wanted(time):
+    """Goal of the output [deg]."""
+    return 25 * np.sin(2 * np.pi * 0.23 * time) + 14 * np.sin(2 * np.pi * 0.71 * time)
+
+
+def encoded(angle):
+    """Reading of an encoder in steps of 0.088 deg [deg]."""
+    return 0.088 * round(np.degrees(angle) / 0.088)
+
+
 def servo(play=0.0, friction=0.17, delay=0, seconds=16.0):
     """Log of a servo: a motor with a lag of 20 ms and dry friction, worth so many volts, a play [deg] behind it.
 
@@ -47,9 +58,8 @@ def servo(play=0.0, friction=0.17, delay=0, seconds=16.0):
     rows, duties = [], [0.0] * (delay + 1)
     for k in range(count):
         if k % every == 0:
-            wanted = 25 * np.sin(2 * np.pi * 0.23 * k * STEP) + 14 * np.sin(2 * np.pi * 0.71 * k * STEP)
-            shown = 0.088 * round(np.degrees(output) / 0.088)
-            duties.append(round(float(np.clip(6 * np.radians(wanted - shown), -1, 1)), 3))
+            shown = encoded(output)
+            duties.append(round(float(np.clip(6 * np.radians(wanted(k * STEP) - shown), -1, 1)), 3))
             rows.append((k * STEP, duties[-1], speed, shown))
         volts = 12 * duties[-1 - delay]
         push = volts - 0.0072 * speed
@@ -84,22 +94,21 @@ def test_play_is_found_and_measured(tmp_path, channels, off):
 
 @pytest.mark.parametrize("stiffness", [5.0, 8.0])
 def test_an_elastic_joint_is_found_with_its_stiffness(tmp_path, stiffness):
-    """Two inertias, a spring and a damper, by steps so short that both are right; an inertia of 6e-3 kg·m²."""
-    motor, load, step, log = 3e-7 * RATIO**2, 6e-3, 2.5e-4, []
-    speed = turned = faster = output = duty = 0.0
+    """The joint of tests/worlds by explicit steps, its load of 6e-3 kg·m², under a controller of the angle."""
+    bench = Bench(
+        resistance=3.1, inductance=2e-3, torque_constant=0.0072, inertia_motor=3e-7, friction_motor=1e-4, ratio=RATIO,
+        efficiency=1.0, inertia=6e-3, loss_coulomb=0.05, loss_viscous=0.0, stiffness=stiffness, damper=0.02,
+    )  # fmt: skip
+    step, state, output, log = 2.5e-4, np.zeros(4), 0.0, []
     for k in range(round(12 / step)):
         if k % round(0.01 / step) == 0:
-            wanted = 25 * np.sin(2 * np.pi * 0.23 * k * step) + 14 * np.sin(2 * np.pi * 0.71 * k * step)
-            shown = 0.088 * round(np.degrees(output) / 0.088)
-            duty = float(np.clip(4 * np.radians(wanted - shown) - 0.05 * speed, -1, 1))
-            log.append((k * step, round(duty, 3), RATIO * speed, shown))
-        torque = stiffness * (turned - output) + 0.02 * (speed - faster)
-        current = (12 * duty - 0.0072 * RATIO * speed) / 3.1
-        speed += step * (RATIO * 0.0072 * current - torque - 0.02 * np.tanh(speed / 0.02)) / motor
-        faster += step * (torque - 0.05 * np.tanh(faster / 0.02)) / load
-        turned, output = turned + step * speed, output + step * faster
+            shown = encoded(output)
+            duty = np.clip(4 * np.radians(wanted(k * step) - shown) - 0.05 * state[1] / RATIO, -1, 1)
+            log.append((k * step, round(duty, 3), state[1], shown))
+        state = state + step * np.array(bench.rates_loose(state, 12 * duty))
+        output += step * state[2]
     runs, robot = read(tmp_path, np.array(log).T, '"output_angle", "motor_speed"')
-    robot = params.replace(robot, {"wheel.inertia": load})
+    robot = params.replace(robot, {"wheel.inertia": bench.inertia})
     (note,) = lost_motion_notes(runs, robot)
     assert note.values["stiffness"] == pytest.approx(stiffness, rel=0.3)
     assert "compliant coupling" in describe(note) and 'stiffness = "' in describe(note)

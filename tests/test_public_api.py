@@ -341,7 +341,7 @@ WRONG_CALL |= {
 
 
 @pytest.mark.parametrize("message", WRONG_CALL)
-def test_wrong_calls_are_said(message, robot):
+def test_simulate_refuses_a_wrong_call_with_place_value_and_limits(message, robot):
     with pytest.raises(mm.UsageError) as error:
         mm.simulate(**{"robot": robot, "conditions": mm.Conditions()} | WRONG_CALL[message])
     assert isinstance(error.value, ValueError) and str(error.value) == message
