@@ -704,3 +704,24 @@ def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_
 
     slopes = _slopes(outputs)
     assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0
+
+
+def _travel(voltage, slope_deg=0.0, changes=None, gearbox=None, **amplitudes):
+    """Steady travel of both configurations under each voltage and slope, effects by their amplitudes."""
+    robot = params.replace(NOMINAL, changes or {})
+    robot = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, **(gearbox or {})))
+    present = tuple(fitted(BY_NAME[name], value) for name, value in amplitudes.items())
+    voltage, slope, configuration = (x.ravel() for x in np.meshgrid(voltage, slope_deg, [0, 1], indexing="ij"))
+    runs = Conditions(configuration, voltage, slope)
+    return runs, steady_batch(with_effects(*present, robot=robot), runs)
+
+
+@pytest.mark.slow
+def test_backdriving_loss_can_be_the_theory_of_the_mesh():
+    down = dict(voltage=[24.0], slope_deg=[-20.0, -10.0], changes={"4W2T.ground.friction.static": 0.9})
+    _, stated = _travel(**down, backdriving_loss=1 - (2 - 1 / 0.74) / 0.74)
+    _, theory = _travel(**down, gearbox={"mesh_theory": True})
+    for name in ("total_current", "motor_speed", "speed"):  # on wheels
+        assert_allclose(getattr(stated, name)[1::2], getattr(theory, name)[1::2], rtol=1e-9)
+    _, without = _travel(**down)
+    assert (np.asarray(without.total_current) < np.asarray(stated.total_current) - 1e-3)[1::2].all()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.random import default_rng
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from test_shaft import SPEEDS, bench, current_of
 from test_worlds_rigs import steady
 from worlds import rigs
@@ -27,7 +27,7 @@ from mmrjax.fidelities.steady import steady_batch, steady_outputs
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
-from mmrjax.model.signals import State
+from mmrjax.model.signals import STATUSES, State
 from sweeps.config import Sweep
 from sweeps.config_campaign import campaign_of_grid
 from tests.commands import read_rig, read_table, text_file
@@ -241,3 +241,17 @@ def test_a_profile_and_a_sweep_state_the_torque(tmp_path, robot):
         mm.sweep(robot, load_torques=[0.5])
     stated = campaign_of_grid(Sweep(load_torques_Nm=(0.0, 0.5), voltages_V=(12.0,), robot="rig.toml")).axes
     assert stated["load_torque"] == [0.0, 0.5]
+
+
+@pytest.mark.slow
+def test_every_fidelity_settles_alike_under_a_brake():
+    at, run = _steady(TORQUE), _driven(TORQUE)
+    for name in ("motor_speed", "total_current", "output_torque"):
+        assert_allclose(run.reading[name], at.reading[name], rtol=1e-6)
+    assert [STATUSES[s] for s in np.asarray(at.status)] == ["converged", "converged", "reverses", "converged"]
+    without = steady_batch(bench(), Conditions(voltage=VOLTS))
+    assert (np.abs(at.motor_speed)[:3] < np.abs(without.motor_speed)[:3]).all()  # it brakes either way
+    assert_array_equal(at.motor_speed[3], without.motor_speed[3])
+    times = time_grid(np.linspace(0, 4.0, 9))
+    shown = jax.jit(history_signals)(bench(), Conditions(voltage=24.0, load_torque=0.5), jnp.asarray(times))
+    assert_allclose(shown.speed_motor[-1], at.motor_speed[0], rtol=1e-6)

@@ -253,8 +253,10 @@ def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(rob
             assert ahead and self.keep("ranking", lambda: 1) == self.keep("search 0", lambda: 1) == 1
             return LoopStages("none")
 
-    monkeypatch.setattr(discover, "trace_windows", lambda _: None)
-    monkeypatch.setattr(discover, "trace_readings", lambda *_: LoopStages("place"))
+    steps = {stage.name: stage for stage in discover.STAGES}
+    windows = steps["windows"]._replace(function=lambda given: None)
+    readings = steps["readings"]._replace(function=lambda *_: LoopStages("place"))
+    monkeypatch.setattr(discover, "STAGES", (windows, steps["base"], steps["settled"], readings))
     trace_verdict = discover.trace_verdict
     monkeypatch.setattr(discover, "trace_verdict", Table.trace)
     given = LoopInput(

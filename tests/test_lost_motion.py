@@ -7,7 +7,7 @@ import pytest
 from worlds.events import Bench
 
 from calibration.described import describe
-from calibration.discovery import discover, stages, verdict
+from calibration.discovery import discover, verdict
 from calibration.discovery.loop_input import LoopInput, prepare_loop
 from calibration.discovery.stages import findings, search_until_clean
 from calibration.inference.lost_motion import lost_motion_notes
@@ -159,8 +159,10 @@ def test_a_rigid_base_that_leaves_only_noise_refutes_the_lost_motion(rejected, m
         SimpleNamespace(space=None),
     )
     monkeypatch.setattr(verdict, "missed_channels", lambda *_: ())
-    monkeypatch.setattr(discover, "trace_windows", lambda _: None)
-    monkeypatch.setattr(stages, "search_until_clean", lambda given, screened, sds: (screened, diagnosis, None))
+    steps = {stage.name: stage for stage in discover.STAGES}
+    search = steps["search"]._replace(function=lambda given, screened, sds: (screened, diagnosis, None))
+    steps |= {"search": search, "windows": steps["windows"]._replace(function=lambda given: None)}
+    monkeypatch.setattr(discover, "STAGES", tuple(steps.values())[1:])
     notes = tuple(lost_motion_notes(runs, robot))
     given = LoopInput(runs, None, robot, *[None] * 4, at_first=notes, keep=lambda name, make: (
         SimpleNamespace(base=base), SimpleNamespace(noise=None)))  # fmt: skip
