@@ -20,6 +20,8 @@ from calibration.discovery.loop_input import LoopInput, prepare_loop, settled_in
 from calibration.discovery.verdict import LoopStages
 from calibration.inference import calibration
 from calibration.inference.conduct import error_after_steps
+from calibration.inference.fit_notes import Remark
+from calibration.inference.foresight import predict_identifiability
 from calibration.inference.shown_states import missing_states_remarks
 from mmrjax.model import channels
 from tests.commands import read_rig
@@ -56,6 +58,12 @@ def swapped(speed):
 
 
 SPEED, VOLTS = "motor_speed_rpm", "supply_voltage_V"
+
+
+def test_one_level_in_a_log_is_reported_before_a_fit(robot, runs):
+    one_level = replace(runs, columns={**runs.columns, VOLTS: np.full(len(runs), 12.0)})
+    doubts = predict_identifiability(one_level, robot).doubts
+    assert Remark("constant", column=VOLTS, value=12.0, alike="voltage") in doubts
 
 
 @pytest.mark.parametrize("column, fault, words", [

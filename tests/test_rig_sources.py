@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.data.stated import example_numbers, is_example
+from calibration.data.stated import example_numbers, has_template_number, is_example
 from mmrjax.model import params
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import rig_from_mujoco, rig_new
@@ -152,3 +152,9 @@ def test_a_replaced_number_is_no_example_even_with_its_comment():
         and not is_example(line.replace("0.05", "0.031"))
         and not is_example("torque_constant = 0.05")
     )
+
+
+def test_a_templates_number_is_recognised_without_its_comment():
+    assert has_template_number('torque_constant = "0.05 ± 5 %"')
+    others = "torque_constant = 0.031", "resistance = 0.05", "# torque_constant = 0.05", "ratio = 1", "[motor]"
+    assert not any(map(has_template_number, others))  # a ratio of 1 may be anyone's

@@ -18,6 +18,7 @@ from mmrjax.model import paper_robots, params, quantities
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import Friction, Ground, Track
+from mmrjax.model.quantities import RPM
 from mmrjax.model.rig import Instrument, Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
@@ -472,6 +473,18 @@ def test_motors_far_from_the_packaged_one_are_read_without_a_doubt(tmp_path, num
     rig = read_rig(tmp_path, MOTOR.format(resistance=numbers[0], constant=numbers[1], friction=numbers[2]))
     runs = records.read_runs(motor_table(*numbers, voltages), rig)
     assert len(runs) == len(voltages) and not check_ranges(runs, rig)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 20])
+def test_a_supply_in_millivolts_and_a_speed_in_rad_per_s_are_doubted(tmp_path, rows):
+    rig = read_rig(tmp_path, MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
+    table = motor_table(0.4, 0.05, 0.01, np.linspace(6, 9, rows))
+    with refused(
+        r"motor_speed_rpm: about 1000 times too small .* check the unit, rpm, supply_voltage_V and the robot"
+    ):
+        check_ranges(records.read_runs({**table, "supply_voltage_V": 1000 * table["supply_voltage_V"]}, rig), rig)
+    with refused(r"motor_speed_rpm: .* are they in rad/s"):
+        check_ranges(records.read_runs({**table, "motor_speed_rpm": RPM * table["motor_speed_rpm"]}, rig), rig)
 
 
 def test_an_offset_of_an_ammeter_is_no_lost_sign(tmp_path):

@@ -223,7 +223,7 @@ def parse_columns(
 
     Args:
         where: beginning of the error message.
-        keys: allowed keys of a column.
+        keys: allowed keys of a column. Only a preset, which allows all, may list several names of a column.
         numbers: numbers that columns may refer to, by name.
 
     Raises:
@@ -273,7 +273,7 @@ def _parse_column(
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
         stated_word(key, keys, where, f"got the key {key}")
-    column = table.get("column")
+    column = table.get("column") if keys is KEYS_OF_COLUMN else stated_as(table.get("column"), str, where, form)
     names = stated_names([column] if isinstance(column, str) else column, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
     for key, power in (("per", -1), ("times", 1)):

@@ -73,6 +73,12 @@ def is_example(line: str) -> bool:
     return EXAMPLE in line and _number_of_line(line) in _template_numbers()
 
 
+def has_template_number(line: str) -> bool:
+    """True if a line has the name and number of a template's example, marked or not. 0 and 1 do not count."""
+    number = _number_of_line(line)
+    return number is not None and number[1] not in (0.0, 1.0) and number in _template_numbers()
+
+
 def example_numbers(text: str) -> dict[str, str]:
     """Names and units of the numbers that are still those of an example, such as `motor.resistance`: `[ohm]`."""
     examples, table = {}, ""

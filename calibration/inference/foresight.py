@@ -24,8 +24,8 @@ from mmrjax.model.signals import STATUSES
 
 #: Notes that call for a look at the table before it is used.
 DOUBTS = (
-    "copied", "larger_noise", "lost_motion", "no_load_gives", "nothing_varies", "off_by", "repeats", "slopes_in",
-    "stiff_supply", "turned", "unused",
+    "constant", "copied", "larger_noise", "lost_motion", "no_load_gives", "nothing_varies", "off_by", "repeats",
+    "slopes_in", "stiff_supply", "turned", "unused",
 )  # fmt: skip
 
 

@@ -116,7 +116,7 @@ def sentence_on_implausible_readings(
     alike = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
     if units:
         return f"{subject}; are they in {' or '.join(units)}? expected {unit}{alike}"
-    return f"{subject}{alike}" if others else f"{subject}; check the unit, {unit}, and the robot's file"
+    return f"{subject}{alike}" if others else f"{subject}; check the unit, {unit}, {imposed} and the robot's file"
 
 
 #: Reasons for fitting the settled runs of a log.

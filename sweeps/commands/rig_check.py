@@ -18,7 +18,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import DerivedFact, NumberOrigin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
-from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, is_example
+from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, has_template_number, is_example
 from calibration.described import as_paragraph, describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import determination
@@ -51,6 +51,7 @@ class RigCheck:
         file: file that was read.
         robot: robot of the file.
         examples: lines of the file that are marked as an example and still have the template's number.
+        unmarked: other lines with the name and number of a template's example, except 0 and 1.
         origins: origins of its numbers.
         facts: values that follow from its numbers.
         runs: runs of the table, None without a table.
@@ -61,6 +62,7 @@ class RigCheck:
     file: str
     robot: Robot
     examples: tuple[int, ...]
+    unmarked: tuple[int, ...]
     origins: tuple[NumberOrigin, ...]
     facts: tuple[DerivedFact, ...]
     runs: Runs | None = None
@@ -101,11 +103,13 @@ class RigCheck:
         notes = []
         if self.robot.rig.inherits:
             notes.append('missing values come from the base, a packaged robot. base = "none" prevents this')
-        if self.examples:
-            notes.append(
-                f"{count_noun(len(self.examples), 'line')} with the template's example number ({EXAMPLE}): "
-                f"{', '.join(map(str, self.examples))}. a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
-            )
+        widened = f"({EXAMPLE}): {{}}. a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
+        for lines, text in (
+            (self.examples, f"example number {widened}"), (self.unmarked, "example: {}. Check that it is yours"),
+        ):  # fmt: skip
+            if lines:
+                numbers = text.format(", ".join(map(str, lines)))
+                notes.append(f"{count_noun(len(lines), 'line')} with the template's {numbers}")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append("with a duty, total_current is that of the supply. Motor leads carry motor_current")
@@ -286,8 +290,9 @@ def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns:
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot
     examples = tuple(k for k, line in enumerate(lines, 1) if is_example(line))
+    unmarked = tuple(k for k, line in enumerate(lines, 1) if has_template_number(line) and k not in examples)
     origins, facts = tuple(rig_facts.number_origins(rig)), tuple(rig_facts.derived_facts(robot))
-    check = RigCheck(rig.name, robot, examples, origins, facts)
+    check = RigCheck(rig.name, robot, examples, unmarked, origins, facts)
     if data is None:
         return check
     runs = read_runs(data, robot, columns=columns, measured=True, series=True)
