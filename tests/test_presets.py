@@ -43,7 +43,7 @@ def robot(tmp_path, *channels, imposed="voltage"):
 def test_every_packaged_preset_can_be_read(name):
     given = ",".join([name, *(f"{key}=2" for key in presets_file.numbers_to_state(name))])
     found = presets_file.find_preset(given)
-    assert found.columns and all(column.factor and column.theirs for column in found.columns)
+    assert found.columns and all(column.factor and column.source_columns for column in found.columns)
 
 
 def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):

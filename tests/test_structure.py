@@ -143,7 +143,7 @@ MORE_NAMES = {
     "sweeps/commands/loop_joints.py": 30,
     "sweeps/commands/missions.py": 33,
     "sweeps/commands/resonance.py": 36,
-    "sweeps/commands/rig_check.py": 46,
+    "sweeps/commands/rig_check.py": 44,
     "sweeps/commands/sensitivity.py": 34,
     "sweeps/commands/simulate.py": 36,
     "sweeps/commands/sweep.py": 49,

@@ -21,8 +21,8 @@ DIGITS = (15, 16, 24, 31, 32)
 PERIODS = (*(2.0**n for n in DIGITS), *(2.0**32 * one for one in (1e-3, 1e-6, 1e-9)))
 #: Largest step across a wrap, in usual steps.
 LACKING = 5.0
-#: Rows are samples of an even clock if at least the first share repeats the stamp of the row before, and at most the
-#: second share of stamps has an unusual number of rows.
+#: Rows are samples of an even clock if at least the first share repeats the stamp of the row before. At most the
+#: second share of stamps then has an unusual number of rows.
 SHARED, ODD = 0.1, 0.1
 
 
@@ -41,17 +41,17 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
     falls = np.flatnonzero(step < 0)
     if not falls.size or not (step > 0).any():
         return count, 0.0
-    usual = float(np.median(step[step > 0]))
+    usual_step = float(np.median(step[step > 0]))
     for period in PERIODS:
-        across = step[falls] + period
+        step_across_wrap = step[falls] + period
         is_counter = period < 2**15 or not (count % 1).any()
         is_within = count.min() >= 0 and count.max() < period
-        if is_counter and is_within and ((across >= 0) & (across <= LACKING * usual)).all():
+        if is_counter and is_within and ((step_across_wrap >= 0) & (step_across_wrap <= LACKING * usual_step)).all():
             wraps = np.zeros(len(count))
             wraps[falls + 1] = 1.0
-            total = np.cumsum(wraps)
+            wraps_before = np.cumsum(wraps)
             first_row_of_run = np.maximum.accumulate(np.where(np.r_[False, ~same_run], np.arange(len(count)), 0))
-            return count + period * (total - total[first_row_of_run]), period
+            return count + period * (wraps_before - wraps_before[first_row_of_run]), period
     return count, 0.0
 
 
@@ -67,24 +67,26 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     """
     if len(time) < 3:
         return time, 0.0
-    begins = np.flatnonzero(np.r_[True, (np.diff(time) != 0) | (np.diff(run) != 0)])
-    rows = np.diff(np.append(begins, len(time)))
-    if (rows - 1).sum() < SHARED * len(time) or (np.diff(time)[np.diff(run) == 0] < 0).any():
+    first_rows = np.flatnonzero(np.r_[True, (np.diff(time) != 0) | (np.diff(run) != 0)])
+    rows_of_each_stamp = np.diff(np.append(first_rows, len(time)))
+    if (rows_of_each_stamp - 1).sum() < SHARED * len(time) or (np.diff(time)[np.diff(run) == 0] < 0).any():
         return time, 0.0
-    step = np.append(np.where(np.diff(run[begins]) == 0, np.diff(time[begins]), np.nan), np.nan)
-    usual = float(np.nanmedian(step)) if np.isfinite(step).any() else np.nan
-    rows_per_stamp = float(np.median(rows))
-    inner_rows = rows[1:-1] if len(rows) > 4 else rows
-    if not np.isfinite(usual) or (np.abs(inner_rows - rows_per_stamp) > 1).mean() > ODD:
+    step = np.append(np.where(np.diff(run[first_rows]) == 0, np.diff(time[first_rows]), np.nan), np.nan)
+    usual_step = float(np.nanmedian(step)) if np.isfinite(step).any() else np.nan
+    rows_per_stamp = float(np.median(rows_of_each_stamp))
+    inner_rows = rows_of_each_stamp[1:-1] if len(rows_of_each_stamp) > 4 else rows_of_each_stamp
+    if not np.isfinite(usual_step) or (np.abs(inner_rows - rows_per_stamp) > 1).mean() > ODD:
         return time, 0.0
-    row_step = np.minimum(np.where(np.isfinite(step), step, usual) / rows, usual / rows_per_stamp * 1.5)
-    index = np.arange(len(time)) - np.repeat(begins, rows)
-    return time + index * np.repeat(row_step, rows), float(rows.mean())
+    row_step = np.minimum(
+        np.where(np.isfinite(step), step, usual_step) / rows_of_each_stamp, usual_step / rows_per_stamp * 1.5
+    )
+    index = np.arange(len(time)) - np.repeat(first_rows, rows_of_each_stamp)
+    return time + index * np.repeat(row_step, rows_of_each_stamp), float(rows_of_each_stamp.mean())
 
 
 #: Day assumed for a time without a date, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
-#: Clocks that read between these seconds since 1970 (1990 and 2100) count from 1970. Second: seconds per count.
+#: Numbers in this range [s] (1990 to 2100) count from 1970. Smaller units of such clocks, in seconds.
 EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: A date as 25.11.2026.
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
@@ -96,12 +98,14 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
     A row is empty if all of its cells are missing, or if it is at the end of a log whose clock has returned to 0.
     Such loggers write out their whole memory.
     """
-    empty = np.arange(len(arrays))
+    empty_rows = np.arange(len(arrays))
     for raw in arrays.values:
-        empty = empty[missing_readings(raw, empty)]
-    if len(arrays) > len(empty) > 0:
-        note = f"left out: {count_noun(len(empty), 'row')} without any reading. Row numbers count only the others"
-        arrays = arrays.rows(~np.isin(np.arange(len(arrays)), empty), note)
+        empty_rows = empty_rows[missing_readings(raw, empty_rows)]
+    if len(arrays) > len(empty_rows) > 0:
+        note = (
+            f"left out: {count_noun(len(empty_rows), 'row')} without any reading. Row numbers count only the others"
+        )
+        arrays = arrays.rows(~np.isin(np.arange(len(arrays)), empty_rows), note)
     by_name = {m.column: raw for m, raw in zip(meanings, arrays.values, strict=True) if m is not None}
     clock = next((by_name[column] for column in TIME if column in by_name), None)
     if clock is None or "run_id" in by_name or not len(arrays):
@@ -130,44 +134,44 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
         runs: `run_id` of each cell. None: all cells belong to one run.
     """
     factor, notes = meaning.value(1.0), list[str]()
-    names, run = np.array([""]), np.zeros(len(raw), int)
+    run_names, run = np.array([""]), np.zeros(len(raw), int)
     if runs is not None:
-        names, run = np.unique(runs, return_inverse=True)
-    clock = np.full(1, np.nan)
+        run_names, run = np.unique(runs, return_inverse=True)
+    seconds = np.full(1, np.nan)
     if isinstance(raw, list) and ":" in raw[0]:
-        clock = np.array([_date_seconds(cell) for cell in raw])
-    of_day = bool(np.isfinite(clock).all())
-    if not of_day:
+        seconds = np.array([_date_seconds(cell) for cell in raw])
+    is_time_of_day = bool(np.isfinite(seconds).all())
+    if not is_time_of_day:
         low, high = (limit * factor for limit in meaning.limits())
         count, notes = _unwrap_clock(f"{name}: {meaning.shown}", column_numbers(raw), run)
-        clock = count * factor
-        of_day = bool((clock > high).all())
-        if of_day and clock[0] > EPOCH[1]:
-            unit = next((u for u, one in PARTS.items() if EPOCH[0] <= clock[0] * one <= EPOCH[1]), None)
+        seconds = count * factor
+        is_time_of_day = bool((seconds > high).all())
+        if is_time_of_day and seconds[0] > EPOCH[1]:
+            unit = next((u for u, one in PARTS.items() if EPOCH[0] <= seconds[0] * one <= EPOCH[1]), None)
             if unit is None:
                 return raw, ()
-            clock = clock * PARTS[unit]
+            seconds = seconds * PARTS[unit]
             notes.append(f"{name}: {meaning.shown} is read as {unit} since 1970, judging by its size")
-        if not of_day and not ((low <= clock) & (clock <= high)).all():
+        if not is_time_of_day and not ((low <= seconds) & (seconds <= high)).all():
             return raw, ()
     if isinstance(raw, list):
-        _add_days_after_midnight(clock, raw, run)
-    start_time = np.full(len(names), clock.min())
-    if len(names) > 1:  # takes ten times as long
+        _add_days_after_midnight(seconds, raw, run)
+    start_time = np.full(len(run_names), seconds.min())
+    if len(run_names) > 1:  # takes ten times as long
         start_time[:] = np.inf
-        np.minimum.at(start_time, run, clock)
+        np.minimum.at(start_time, run, seconds)
     if not start_time.any():
-        return (clock / factor if notes else raw), tuple(notes)
-    if of_day:
+        return (seconds / factor if notes else raw), tuple(notes)
+    if is_time_of_day:
         notes.append(f"{name}: {meaning.shown} is a time of day, counted from the first row of each run")
     else:
-        first = run[np.flatnonzero(start_time[run])[0]]
-        run_words = f" in run {names[first]}" if names[first] else ""
+        run_index = run[np.flatnonzero(start_time[run])[0]]
+        run_words = f" in run {run_names[run_index]}" if run_names[run_index] else ""
         notes.append(
-            f"{name}: {meaning.shown} begins at {start_time[first] / factor:g}{run_words}, and counts from the first "
-            "row of a run. If it began earlier, add a row without readings then"
+            f"{name}: {meaning.shown} begins at {start_time[run_index] / factor:g}{run_words}, and counts from the "
+            "first row of a run. If it began earlier, add a row without readings then"
         )
-    return np.round(clock - start_time[run], 9) / factor, tuple(notes)
+    return np.round(seconds - start_time[run], 9) / factor, tuple(notes)
 
 
 def _unwrap_clock(place: str, count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, list[str]]:

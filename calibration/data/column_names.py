@@ -112,7 +112,7 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
     if not units or meaning.factor != 1.0:
         return ""
     columns_by_unit = {unit: column for column, unit in quantity.columns().items()}
-    in_unit = column_unit or "shares of 1"
+    unit_text = column_unit or "shares of 1"
     value = cell_number(cell)
     match = _WITH_UNIT.fullmatch(cell) if math.isnan(value) else None
     if match is not None:  # a unit is written next to the number
@@ -120,7 +120,7 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
         if unit == column_unit:
             return f"write {match[1]}, since the unit is in the column's name; "
         if unit in columns_by_unit:
-            return f"write numbers without units, in {in_unit}, or name the column {columns_by_unit[unit]}; "
+            return f"write numbers without units, in {unit_text}, or name the column {columns_by_unit[unit]}; "
         return f"write only the number{f', in {column_unit}' if column_unit else ''}; "
     if not abs(value) > FAR * max(map(abs, quantity.limits(column_unit))):
         return ""
@@ -150,26 +150,30 @@ def match_column_names(
         BadData: a name occurs twice.
     """
     full_layout = replace(layout, channels=channels.EVERY)
-    spelled: dict[str, set[str]] = {}
+    spellings: dict[str, set[str]] = {}
     for column in (full_layout if inferred else layout).spellings():
-        spelled.setdefault(column.casefold(), set()).add(column)
+        spellings.setdefault(column.casefold(), set()).add(column)
     matched_names, notes = [], []
     for column in header:
-        meant = spelled.get(column.casefold(), set())
-        if column not in meant and len(meant) == 1 and not meant & set(header):
-            (right,) = meant
-            notes.append(f"{name}: column {column} is read as {right}")
-            column = right
+        possible = spellings.get(column.casefold(), set())
+        if column not in possible and len(possible) == 1 and not possible & set(header):
+            (spelling,) = possible
+            notes.append(f"{name}: column {column} is read as {spelling}")
+            column = spelling
         matched_names.append(column)
     repeated = min((c for c in matched_names if matched_names.count(c) > 1), default=None)
     if repeated is not None:
         raise BadData(f"{name}: column {repeated} is present {matched_names.count(repeated)} times; expected once")
     if inferred or of_turns:
-        present = {m.column for m in full_layout.meanings(name, matched_names) if m is not None}
-        turns = of_turns and {*layout.sides, *VOLTS, *HEADING} & present
-        more = channels.EVERY if inferred else channels.OF_TURNS if turns else ()
-        read = (c for c in channels.EVERY if c in layout.channels or (c in more and c.column in present))
-        layout = replace(layout, channels=tuple(read))
+        present_columns = {m.column for m in full_layout.meanings(name, matched_names) if m is not None}
+        has_turns = of_turns and {*layout.sides, *VOLTS, *HEADING} & present_columns
+        further_channels = channels.EVERY if inferred else channels.OF_TURNS if has_turns else ()
+        read_channels = (
+            c
+            for c in channels.EVERY
+            if c in layout.channels or (c in further_channels and c.column in present_columns)
+        )
+        layout = replace(layout, channels=tuple(read_channels))
     return matched_names, layout, tuple(notes)
 
 
@@ -186,43 +190,43 @@ def check_header(
     if not layout.complete:  # names of other channels are not misspellings
         strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
     _check_names_of_sides(name, strange, present, layout)
-    supplied = set()  # required columns that follow from others
+    implied = set()  # required columns that follow from others
     if layout.imposed_column == SPEED and present & set(layout.sides):  # the sides' speeds are imposed
-        supplied.add(SPEED)
+        implied.add(SPEED)
         if SPEED in present:
             raise BadData(f"{name}: column {SPEED} in addition to {', '.join(layout.sides)}; keep one of them")
     if present & set(VOLTS):  # the supply's voltage is the larger one
-        supplied.add(SUPPLY)
+        implied.add(SUPPLY)
     if not layout.complete and "surface" in present:  # its labels may belong to one configuration
-        supplied.add("configuration")
-    required = [c for c in layout.required(measured=measured, battery=battery) if c not in supplied]
+        implied.add("configuration")
+    required = [c for c in layout.required(measured=measured, battery=battery) if c not in implied]
     for column in (c for c in (*required, *layout.measured_columns) if c not in present):
-        close = difflib.get_close_matches(column, strange, 1, 0.6)
-        if column in required or (close and layout.complete):
-            suggestion = f"; did you mean {close[0]}?" if close else ""
+        similar = difflib.get_close_matches(column, strange, 1, 0.6)
+        if column in required or (similar and layout.complete):
+            suggestion = f"; did you mean {similar[0]}?" if similar else ""
             if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # they may be readings too
                 suggestion = "; the columns that drive the sides can be named under [columns]: " + ", ".join(
                     f'{volts} = "motor_{volts}"' for volts in VOLTS
                 )
-            elif column == SUPPLY and CURRENT in present and not close:
+            elif column == SUPPLY and CURRENT in present and not similar:
                 suggestion = f'; record it, or set imposed = "motor_current" if {CURRENT} is commanded'
-            advice = "" if close else _advice_on_unknown_columns(strange, column)
+            advice = "" if similar else _advice_on_unknown_columns(strange, column)
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{suggestion} (required: {', '.join(required)})"
                 f"{advice}"
             )
     if measured and present.isdisjoint(layout.measured_columns):
-        other = _advice_on_unknown_columns(strange, layout.measured_columns[0])
-        turning = {c.column: c.name for c in channels.OF_TURNS if c.column in strange}
-        if turning:
-            names = ", ".join(f'"{channel}"' for channel in turning.values())
-            other = f"; {', '.join(turning)}: set channels = [{names}] in the robot's file"
+        readings_advice = _advice_on_unknown_columns(strange, layout.measured_columns[0])
+        turning_channels = {c.column: c.name for c in channels.OF_TURNS if c.column in strange}
+        if turning_channels:
+            names = ", ".join(f'"{channel}"' for channel in turning_channels.values())
+            readings_advice = f"; {', '.join(turning_channels)}: set channels = [{names}] in the robot's file"
         expected = ", ".join(layout.measured_columns)
-        raise BadData(f"{name}: no column with readings; expected at least one of {expected}{other}")
+        raise BadData(f"{name}: no column with readings; expected at least one of {expected}{readings_advice}")
     for column in strange:
-        close = difflib.get_close_matches(column, [c for c in layout.known() if c not in present], 1, 0.85)
-        if close:
-            raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
+        similar = difflib.get_close_matches(column, [c for c in layout.known() if c not in present], 1, 0.85)
+        if similar:
+            raise BadData(f"{name}: unknown column {column}; did you mean {similar[0]}? rename or remove it")
 
 
 def unread_channel_notes(name: str, robot: Robot, unread: Collection[str]) -> Names:
@@ -232,13 +236,13 @@ def unread_channel_notes(name: str, robot: Robot, unread: Collection[str]) -> Na
         unread: columns of the table without a meaning.
     """
     notes = []
-    for own_column, logger_column, _ in robot.rig.columns:
-        channel = next((c for c in channels.EVERY if own_column in c.columns()), None)
-        if logger_column in unread and channel is not None:
+    for column, source_column, _ in robot.rig.columns:
+        channel = next((c for c in channels.EVERY if column in c.columns()), None)
+        if source_column in unread and channel is not None:
             braked = channel.name == "output_torque" and not robot.has_ground
             cure = ", or assign the column to load_torque_Nm if a brake sets this torque" * braked
             notes.append(
-                f"{name}, {logger_column}: not read, because the robot file assigns it to {own_column}, and "
+                f"{name}, {source_column}: not read, because the robot file assigns it to {column}, and "
                 f'"channels" does not list {channel.name}. Add it there{cure}'
             )
     return tuple(notes)
@@ -247,12 +251,12 @@ def unread_channel_notes(name: str, robot: Robot, unread: Collection[str]) -> Na
 def check_has_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
     """Rejects readings of a log without a time column."""
     shown_names = {m.column: m.shown for m in meanings if m is not None}
-    over_time = [shown_names[c.column] for c in layout.channels if c.column in shown_names and not c.settled]
-    if over_time and shown_names.keys().isdisjoint(TIME):
+    sampled_columns = [shown_names[c.column] for c in layout.channels if c.column in shown_names and not c.settled]
+    if sampled_columns and shown_names.keys().isdisjoint(TIME):
         strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
         raise BadData(
-            f"{name}: column {layout.expected('time_s')} is missing, and {over_time[0]} can be used only in a "
-            f"time history; if these are settled runs, remove {over_time[0]}"
+            f"{name}: column {layout.expected('time_s')} is missing, and {sampled_columns[0]} can be used only in a "
+            f"time history; if these are settled runs, remove {sampled_columns[0]}"
             f"{_advice_on_unknown_columns(strange, 'time_s')}"
         )
 
@@ -276,17 +280,19 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
     def sorted_words(column: str) -> tuple[str, ...]:
         return tuple(sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_")))
 
-    of_sides = {sorted_words(c): c for c in layout.known() if {*channels.SIDES} & {*sorted_words(c)}}
-    turns = {*SIDES} <= {*of_sides.values()} and not stated.isdisjoint(c.column for c in channels.OF_TURNS)
+    column_by_words = {sorted_words(c): c for c in layout.known() if {*channels.SIDES} & {*sorted_words(c)}}
+    has_turn_readings = {*SIDES} <= {*column_by_words.values()} and not stated.isdisjoint(
+        c.column for c in channels.OF_TURNS
+    )
     for column in strange:
-        meant = of_sides.get(sorted_words(column))
+        meant = column_by_words.get(sorted_words(column))
         if meant is not None and meant not in stated:
             raise BadData(
                 f"{name}: column {column}: the sides are called left and right; rename it to {meant}, or set "
                 f'[columns] {meant} = "{column}" in the robot\'s file'
             )
         side = next((side for side in channels.SIDES if side in sorted_words(column)), None)
-        if side and turns and not stated & {*SIDES, *VOLTS} and column.endswith("V"):
+        if side and has_turn_readings and not stated & {*SIDES, *VOLTS} and column.endswith("V"):
             raise BadData(
                 f"{name}: column {column}: if it is the voltage of the {side} side, rename it to "
                 f'voltage_{side}_V, or set [columns] voltage_{side}_V = "{column}" in the robot\'s file'

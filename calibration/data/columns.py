@@ -46,7 +46,7 @@ CIRCUITS = dict(zip(DRIVEN, (0.0, -1.0, 1.0), strict=True))
 DRIVING = ("duty", "mode")
 #: Duty of each side's motors, for a robot whose sides are driven independently.
 SIDES = {c: BY_COLUMN[c] for c in ("duty_left", "duty_right")}
-#: The same in volts, converted to shares (`sides.duties_from_side_voltages`).
+#: The same in volts, converted to shares (`contradictions.with_duties_of_sides`).
 VOLTS = {c: BY_COLUMN[c] for c in ("voltage_left_V", "voltage_right_V")}
 #: The same where speeds are imposed.
 SPEEDS = tuple(channels.find_channel(f"motor_speed_{side}").column for side in channels.SIDES)
@@ -134,8 +134,10 @@ class Layout:
         weight = any(float(x) != 0 for load in loads for x in (load.torque_constant, load.torque_gravity))
         names = robot.configurations.names
         supply = 0.0 if robot.controller is None else robot.controller.supply_voltage
-        choices = rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns
-        return cls(*choices, robot.channels, supply)
+        return cls(
+            rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns, robot.channels,
+            supply,
+        )  # fmt: skip
 
     @property
     def complete(self) -> bool:
@@ -162,8 +164,8 @@ class Layout:
     @property
     def sides(self) -> Names:
         """Columns of the commands of the left and right side. Empty if the robot cannot turn."""
-        imposed = {"voltage": tuple(SIDES), "motor_speed": SPEEDS}.get(self.imposed, ())
-        return imposed if self.has_ground else ()
+        side_columns = {"voltage": tuple(SIDES), "motor_speed": SPEEDS}.get(self.imposed, ())
+        return side_columns if self.has_ground else ()
 
     @property
     def axes(self) -> Names:
@@ -190,29 +192,29 @@ class Layout:
 
     def known(self) -> Names:
         """Every column that has a meaning."""
-        read = (SUPPLY, *self.measured_columns, *self.deviation_columns)
+        reading_columns = (SUPPLY, *self.measured_columns, *self.deviation_columns)
         labels = [word for word in WORDS if word != "mode" or self.imposed in ("voltage", *GOALS)]
-        set_ = [c.column for c in quantities.SET if c.in_tables and self.imposed in (c.imposed or IMPOSED)]
-        column_names = ("configuration", *self.axes, *read, *labels, "time_s", *self.sides, *set_)
+        set_columns = [c.column for c in quantities.SET if c.in_tables and self.imposed in (c.imposed or IMPOSED)]
+        column_names = ("configuration", *self.axes, *reading_columns, *labels, "time_s", *self.sides, *set_columns)
         return tuple(dict.fromkeys(c for c in column_names if c not in self.idle))
 
     def required(self, *, measured: bool, battery: bool) -> Names:
         """Columns that a table must have besides channels."""
         if self.complete:
-            further = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
-            return tuple(c for c in ("configuration", *CONDITIONS) if c not in further)
-        imposed: Names = () if battery and self.imposed == "voltage" else (self.imposed_column,)
-        imposed += (SUPPLY,) if self.imposed in GOALS and not self.supply else ()
-        return (("configuration",) if len(self.configurations) != 1 else ()) + imposed
+            optional = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
+            return tuple(c for c in ("configuration", *CONDITIONS) if c not in optional)
+        columns: Names = () if battery and self.imposed == "voltage" else (self.imposed_column,)
+        columns += (SUPPLY,) if self.imposed in GOALS and not self.supply else ()
+        return (("configuration",) if len(self.configurations) != 1 else ()) + columns
 
     def quantities(self) -> dict[str, Quantity]:
         """Quantity of each column, including conditions that do not act on the load."""
         present_channels = [
             c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)
         ]
-        rows = (*quantities.LABELS, *quantities.SET, *(q for c in present_channels for q in (c, c.deviation)))
+        candidates = (*quantities.LABELS, *quantities.SET, *(q for c in present_channels for q in (c, c.deviation)))
         known_columns = {*self.known(), *ON_GROUND, *ON_SHAFT}
-        return {q.column: q for q in rows if q.column in known_columns}
+        return {q.column: q for q in candidates if q.column in known_columns}
 
     def meanings(self, source: str, header: list[str]) -> list[Column | None]:
         """Quantity of each column of a file, None for an unknown column. A name may state any unit of its quantity.
@@ -221,29 +223,29 @@ class Layout:
             BadData: two columns hold the same quantity.
         """
         by_name = self._by_name
-        mapped = {column: (own_name, factor) for own_name, column, factor in self.mapped if column in header}
+        mapped = {column: (name, factor) for name, column, factor in self.mapped if column in header}
         unread = {name for c in channels.EVERY for q in (c, c.deviation) for name in q.columns()} if mapped else set()
-        mapped_columns = {by_name[own_name].column for own_name, _ in mapped.values() if own_name in by_name}
+        mapped_columns = {by_name[name].column for name, _ in mapped.values() if name in by_name}
         meanings: list[Column | None] = []
         for column in header:
             if column not in mapped:
                 meant = by_name.get(column)
                 meanings.append(None if meant is None or meant.column in mapped_columns else meant)
                 continue
-            own_name, factor = mapped[column]
-            meant = by_name.get(own_name)
-            if meant is None and own_name not in unread:
+            name, factor = mapped[column]
+            meant = by_name.get(name)
+            if meant is None and name not in unread:
                 raise BadData(
-                    f"{source}: the robot's file reads {own_name} from column {column}; mmrjax has no column "
-                    f"{own_name} (known: {', '.join(self.known())})"
+                    f"{source}: the robot's file reads {name} from column {column}; mmrjax has no column "
+                    f"{name} (known: {', '.join(self.known())})"
                 )
             meanings.append(None if meant is None else replace(meant, shown=column, factor=factor))
-        first: dict[str, Column] = {}
+        meaning_by_column: dict[str, Column] = {}
         for meaning in filter(None, meanings):
-            twin = first.setdefault(meaning.column, meaning)
-            if meaning.shown != twin.shown:
+            first = meaning_by_column.setdefault(meaning.column, meaning)
+            if meaning.shown != first.shown:
                 raise BadData(
-                    f"{source}: columns {twin.shown} and {meaning.shown} have the same meaning; keep one of them"
+                    f"{source}: columns {first.shown} and {meaning.shown} have the same meaning; keep one of them"
                 )
         return meanings
 
@@ -269,27 +271,27 @@ class Layout:
             stated: columns that the table already has, which are left out.
         """
         ignored = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
-        spelled = {
+        column_and_unit = {
             s: (column, unit)
             for column, q in self.quantities().items()
             if column not in ignored
             for s, unit in q.columns().items()
         }
-        unit = quantities.unit_at_end(name, {unit for _, unit in spelled.values()})
+        unit = quantities.unit_at_end(name, {unit for _, unit in column_and_unit.values()})
         pool = [
             s
-            for s, (column, spelled_unit) in spelled.items()
+            for s, (column, spelled_unit) in column_and_unit.items()
             if spelled_unit == unit or (unit is None and s == column)
         ]
         close = difflib.get_close_matches(name.casefold(), [s.casefold() for s in pool], 1, ALIKE)
         if close:
             return next(s for s in pool if s.casefold() == close[0])
-        in_unit = [s for s in pool if unit and spelled[s][0] not in self.measured_columns]
-        return in_unit[0] if len(in_unit) == 1 else ""
+        names_in_unit = [s for s in pool if unit and column_and_unit[s][0] not in self.measured_columns]
+        return names_in_unit[0] if len(names_in_unit) == 1 else ""
 
     def expected(self, column: str) -> str:
         """Name of the column, and its name in the source if the robot file states one."""
-        for own_name, source_column, _ in self.mapped:
-            if own_name == column or (own_name in self._by_name and self._by_name[own_name].column == column):
+        for name, source_column, _ in self.mapped:
+            if name == column or (name in self._by_name and self._by_name[name].column == column):
                 return f"{column} (in the robot's file: {source_column})"
         return column

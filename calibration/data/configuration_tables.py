@@ -55,9 +55,9 @@ def allowed_labels(label: str, layout: Layout) -> str:
         return "" if label else "the name of a surface"
     if label in SURFACES:
         return ""
-    alike = difflib.get_close_matches(label, SURFACES, 1, MISSPELT)
+    similar = difflib.get_close_matches(label, SURFACES, 1, MISSPELT)
     return (
-        f"one of these; {allowed_words(label, SURFACES)}" if not label or alike or not layout.configurations else ""
+        f"one of these; {allowed_words(label, SURFACES)}" if not label or similar or not layout.configurations else ""
     )
 
 
@@ -74,22 +74,22 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
     labelled = SURFACES if robot.rig.scales_adhesion else ()
     leaders: dict[str, str] = {}
     for configuration in dict.fromkeys(c for c, _ in pairs):
-        on = {label: configuration_on_surface(configuration, label) for c, label in pairs if c == configuration}
-        separate = [name for label, name in on.items() if label not in labelled or name in members]
-        present = [name for name in separate if name in members]
+        names = {label: configuration_on_surface(configuration, label) for c, label in pairs if c == configuration}
+        separate = [name for label, name in names.items() if label not in labelled or name in members]
+        existing = [name for name in separate if name in members]
         is_member = configuration in members
-        if not separate or (not present and (len(on) == 1 or not is_member)):
+        if not separate or (not existing and (len(names) == 1 or not is_member)):
             continue
-        is_kept = is_member and len(separate) < len(on)
-        pattern = members[configuration if is_member else present[0]]
-        added = {name: members.get(name, pattern) for name in separate}
+        is_kept = is_member and len(separate) < len(names)
+        template = members[configuration if is_member else existing[0]]
+        surface_loads = {name: members.get(name, template) for name in separate}
         if is_member and not is_kept:  # they replace the configuration
-            parts = [added if name == configuration else {name: load} for name, load in members.items()]
+            parts = [surface_loads if name == configuration else {name: load} for name, load in members.items()]
             members = {name: load for part in parts for name, load in part.items()}
         else:
-            members |= added
+            members |= surface_loads
         first = configuration if is_kept else separate[0]
-        leaders |= {name: first for name in added if name != first}
+        leaders |= {name: first for name in surface_loads if name != first}
     rig = replace(robot.rig, surfaces=tuple(leaders.items()))
     robot = replace(robot, configurations=Configurations(members), rig=rig)
     priors = values_of_surface_configurations({name: (mean, sd) for name, mean, sd in rig.priors}, robot, runs)
@@ -118,9 +118,9 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
         if configuration in robot.configurations or not rows.any():
             new_names.append(name)
             continue
-        on = dict.fromkeys(configuration_on_surface(configuration, s) for s in runs["surface"][rows])
-        present = [n for n in on if n in robot.configurations]
-        new_names += [f"{n}.{key}" for n in present[: None if key.startswith((GROUND, "*")) else 1]]
+        surface_names = dict.fromkeys(configuration_on_surface(configuration, s) for s in runs["surface"][rows])
+        existing = [n for n in surface_names if n in robot.configurations]
+        new_names += [f"{n}.{key}" for n in existing[: None if key.startswith((GROUND, "*")) else 1]]
     return new_names
 
 
@@ -171,23 +171,23 @@ def loads_from_tables(
             file has both shafts and vehicles. A robot with a base lacks a required parameter.
     """
     load_names = [n for n, table in content.items() if n not in TAKEN and isinstance(table, dict)]
-    usual = load_names if base is None else list(base.configurations)
-    if not usual and "configurations" not in content:
+    default_names = load_names if base is None else list(base.configurations)
+    if not default_names and "configurations" not in content:
         raise BadConfiguration(
             f"{where}: no load is defined; add a table such as [bench] with load = one of {', '.join(rig_file.LOADS)}"
         )
-    names = _names(content.pop("configurations", usual), f"{where}, configurations")
+    names = _configuration_names(content.pop("configurations", default_names), f"{where}, configurations")
     for name in load_names:
         if name not in names and set(_KINDS) & set(content[name]):
-            nothing = f', or set base = "{rig_file.NONE}" for a rig that is described completely in this file'
+            base_hint = f', or set base = "{rig_file.NONE}" for a rig that is described completely in this file'
             raise BadConfiguration(
                 f"{where}, {name}: not one of the configurations {', '.join(names)}; add it to configurations = "
-                f"[...]{'' if base is None else nothing}"
+                f"[...]{'' if base is None else base_hint}"
             )
     # An invalid number of drives is rejected later.
     sides = content.get("sides", 1.0 if base is None else float(base.sides))
     sides = float(sides) if isinstance(sides, int | float) and sides >= 1 else 1.0
-    by_name: dict[str, Load] = {}
+    loads: dict[str, Load] = {}
     missing: list[str] = []
     linear: set[str] = set()
     for name in names:
@@ -198,23 +198,23 @@ def loads_from_tables(
             rig_file.linear_to_shaft(table, name, table_place, sds, sides)
             linear.add(name)
         if kind != "vehicle":
-            by_name[name] = Shaft(inertia=0.0, loss_coulomb=0.0)
-            lacking = _missing_parameters(by_name[name], table)
+            loads[name] = Shaft(inertia=0.0, loss_coulomb=0.0)
+            lacking = _missing_parameters(loads[name], table)
         elif base is None:
-            by_name[name], lacking = _blank_vehicle(table, table_place, sides)
+            loads[name], lacking = _blank_vehicle(table, table_place, sides)
         else:
-            by_name[name] = _chassis_of_base(base, name, table, table_place)
+            loads[name] = _chassis_of_base(base, name, table, table_place)
         if base is not None:
             _reject_incomplete(f"{table_place}: without a base, the load must be described completely", lacking)
         missing += [f"{name}.{key}" for key in lacking]
-    shafts = [name for name, load in by_name.items() if isinstance(load, Shaft)]
+    shafts = [name for name, load in loads.items() if isinstance(load, Shaft)]
     vehicles = [name for name in names if name not in shafts]
     if shafts and vehicles:
         raise BadConfiguration(
             f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; a file can describe only one kind; use "
             "two files"
         )
-    return by_name, not shafts or bool(linear), frozenset(linear), missing
+    return loads, not shafts or bool(linear), frozenset(linear), missing
 
 
 def resolve_likes(content: Json, where: str) -> None:
@@ -260,8 +260,8 @@ def _blank_vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list
             f"{where}: the kind of load is missing; set load = one of {', '.join(rig_file.LOADS)}, or movers = "
             f"one of {', '.join(MOVERS)}"
         )
-    on_tracks = _movers(table.pop("movers"), where)
-    nothing = Chassis(
+    on_tracks = _parse_movers(table.pop("movers"), where)
+    blank = Chassis(
         track=Track(loss_coulomb=0.0, loss_viscous=0.0, guide_share=0.0),
         ground=Ground(Friction(static=0.0, dynamic=0.0), rolling_resistance=0.0),
         on_tracks=on_tracks,
@@ -271,11 +271,11 @@ def _blank_vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list
     )
     values = flat_table(table)
     defaults = rig_file.vehicle_defaults(on_tracks > 0.5, values, sides)
-    missing = [p.name for p in params.walk_parameters(nothing) if p.name not in {**defaults, **values}]
-    return params.replace(nothing, {name: params.as_float(value) for name, value in defaults.items()}), missing
+    missing = [p.name for p in params.walk_parameters(blank) if p.name not in {**defaults, **values}]
+    return params.replace(blank, {name: params.as_float(value) for name, value in defaults.items()}), missing
 
 
-def _movers(stated: Any, where: str) -> float:
+def _parse_movers(stated: Any, where: str) -> float:
     return MOVERS[stated_word(stated, MOVERS, f"{where}.movers")]
 
 
@@ -285,7 +285,7 @@ def _reject_incomplete(beginning: str, missing: list[str]) -> None:
         raise BadConfiguration(f"{beginning}; {', '.join(missing)} {verb} missing")
 
 
-def _names(stated: Any, where: str) -> Names:
+def _configuration_names(stated: Any, where: str) -> Names:
     names = stated_names(stated, where, f"a list of at least one name, such as {_EXAMPLE}")
     for name in names:
         if names.count(name) > 1:
@@ -302,25 +302,25 @@ def _names(stated: Any, where: str) -> Names:
 def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassis:
     """Configuration of a robot with a base, before the parameters of its table are applied."""
     like, movers = table.pop("like", None), table.pop("movers", None)
-    have = robot.configurations
+    configurations = robot.configurations
     if like is not None and movers is not None:
         raise BadConfiguration(f"{where}: like and movers contradict each other; give one of them")
     if like is not None:
-        return have[stated_word(like, have.names, f"{where}.like")]
+        return configurations[stated_word(like, configurations.names, f"{where}.like")]
     if movers is not None:
-        pattern = replace(have.members[0], on_tracks=_movers(movers, where))
+        template = replace(configurations.members[0], on_tracks=_parse_movers(movers, where))
         _reject_incomplete(
             f"{where}: with movers instead of like, the configuration must be described completely",
-            _missing_parameters(pattern, table),
+            _missing_parameters(template, table),
         )
         return params.replace(
-            pattern, {n: params.as_float(x) for n, x in _parameter_defaults(pattern) if x is not None}
+            template, {n: params.as_float(x) for n, x in _parameter_defaults(template) if x is not None}
         )
-    if name in have:
-        return have[name]
+    if name in configurations:
+        return configurations[name]
     raise BadConfiguration(
-        f'{where}: the base has no such configuration; set like = "{have.names[0]}" (one of {", ".join(have)}), '
-        'or movers = "tracks" or "wheels" and its parameters'
+        f'{where}: the base has no such configuration; set like = "{configurations.names[0]}" (one of '
+        f'{", ".join(configurations)}), or movers = "tracks" or "wheels" and its parameters'
     )
 
 

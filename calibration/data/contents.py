@@ -85,51 +85,54 @@ def inspect_source(source: str | Path | Any) -> FileContents:
     Raises:
         BadData: the file does not exist, cannot be read, or has no columns.
     """
-    contents = _source(source)
+    contents = _open_source(source)
     name, signals, notes = contents.name, contents.signals, [*contents.notes]
-    clocks = {id(s.clock) for s in signals if s.clock is not None}
-    table = clock = None
-    if not clocks:  # the time column of a table
-        table = next((s for s in signals if not (s.words or s.refused) and _unit_of_time(s.name) is not None), None)
-    if table is not None:
-        clock = Clock(table.path, table.load, _unit_of_time(table.name) or "")
+    clock_ids = {id(s.clock) for s in signals if s.clock is not None}
+    time_signal = clock = None  # of a table
+    if not clock_ids:
+        time_signal = next(
+            (s for s in signals if not (s.words or s.refused) and _unit_of_time(s.name) is not None), None
+        )
+    if time_signal is not None:
+        clock = Clock(time_signal.path, time_signal.load, _unit_of_time(time_signal.name) or "")
     times: dict[int, np.ndarray | str] = {}
-    facts = tuple(_facts(s, s.clock or (None if s is table else clock), times) for s in signals)
+    facts = tuple(_signal_facts(s, s.clock or (None if s is time_signal else clock), times) for s in signals)
     faults = (times.get(id(s.clock)) for s in signals if s.clock is not None)
     notes += dict.fromkeys(f"{name}: {fault}" for fault in faults if isinstance(fault, str))
     preset = presets_file.recognise_preset([s.path for s in signals])
-    if len(clocks) > 1:
+    if len(clock_ids) > 1:
         notes.append(
-            f"{name}: signals have {len(clocks)} clocks. Rows are taken at the samples of the densest channel"
+            f"{name}: signals have {len(clock_ids)} clocks. Rows are taken at the samples of the densest channel"
         )
-    read = [replace(s, refused=f.refused) for s, f in zip(signals, facts, strict=True)]
+    checked_signals = [replace(s, refused=f.refused) for s, f in zip(signals, facts, strict=True)]
     constant = {fact.path for fact in facts if fact.least == fact.greatest}
-    lines = dict(_proposed_columns(sorted(read, key=lambda s: s.path in constant)))  # of several, one that changes
-    proposed = () if preset else tuple(lines[s.path] for s in signals if s.path in lines)
+    # Of several signals for a column, one that changes is proposed.
+    line_by_path = dict(_proposed_columns(sorted(checked_signals, key=lambda s: s.path in constant)))
+    proposed = () if preset else tuple(line_by_path[s.path] for s in signals if s.path in line_by_path)
     return FileContents(name, contents.kind, facts, tuple(notes), preset, proposed)
 
 
-def _source(source: Any) -> Source:
+def _open_source(source: Any) -> Source:
     if not isinstance(source, str | Path):
         return opening.open_object(source)
     if group := opening.files_of_group(str(source)):
-        first_source = _source(group[0])
+        first_source = _open_source(group[0])
         note = f"{source}: {len(group)} files, each a run; these are the signals of {group[0].name}"
         return replace(first_source, notes=(note, *first_source.notes))
     path, signal_path = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():
         raise BadData(f"{source}: no such file; expected a file of data, or the folder of a ROS 2 bag")
-    form = opening.format_of(path, name)
-    if form is not None:
-        return opening.open_signals(path, signal_path, name, form)
-    table = _signals_of_text(delimited.read_csv_columns(path, name))
+    file_format = opening.format_of(path, name)
+    if file_format is not None:
+        return opening.open_signals(path, signal_path, name, file_format)
+    table = _source_of_text(delimited.read_csv_columns(path, name))
     if not table.signals:
         raise BadData(f"{name}: the file is empty; expected a header and rows")
     return table.below(signal_path) if signal_path else table
 
 
-def _signals_of_text(arrays: NamedArrays) -> Source:
+def _source_of_text(arrays: NamedArrays) -> Source:
     """Table of texts as signals: a column is numeric if most of its cells are numbers."""
     signals = []
     for k, (name, raw) in enumerate(zip(arrays.header, arrays.values, strict=True)):
@@ -147,7 +150,7 @@ def _unit_of_time(name: str) -> str | None:
     return "ms" if plain_name == "ms_today" else unit_of_clock(plain_name)
 
 
-def _facts(signal: Signal, clock: Clock | None, times: dict[int, np.ndarray | str]) -> SignalFacts:
+def _signal_facts(signal: Signal, clock: Clock | None, times: dict[int, np.ndarray | str]) -> SignalFacts:
     clock_name = "" if clock is None else clock.name
     facts = SignalFacts(signal.path, signal.unit, signal.length, signal.refused, clock=clock_name)
     if signal.refused or not signal.length:
@@ -164,14 +167,14 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, np.ndarray | st
         facts = replace(facts, least=float(finite.min()), greatest=float(finite.max()))
     rate = gaps = np.nan
     if clock is not None:
-        time = times[id(clock)] = times[id(clock)] if id(clock) in times else _seconds(clock)
+        time = times[id(clock)] = times[id(clock)] if id(clock) in times else _clock_times(clock)
         if not isinstance(time, str) and len(time) == len(values):
             step, usual = np.diff(time), one_clock.usual_step(time)
             rate, gaps = 1 / usual, float((step > GAP * usual).sum())
     return replace(facts, missing=len(values) - len(finite), rate=rate, gaps=gaps)
 
 
-def _seconds(clock: Clock) -> np.ndarray | str:
+def _clock_times(clock: Clock) -> np.ndarray | str:
     """Times of a clock [s], or the reason why they cannot be used."""
     try:
         time, *_ = one_clock.clock_seconds(clock)
@@ -183,44 +186,44 @@ def _seconds(clock: Clock) -> np.ndarray | str:
 
 def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     """Paths of signals that may be columns, each with its line of a table `[columns]`: the time, then the others."""
-    spelled = set(Layout(channels=channels.EVERY).spellings())
+    known_names = set(Layout(channels=channels.EVERY).spellings())
     row_signals = [s for s in signals if s.clock is None and not s.refused]
     time_signal = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
     clock = time_signal or next((s for s in row_signals if _is_rising_count(s)), None)
     other_signals = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
     elapsed = None
     if clock is not None:
-        count = None if clock.words else np.asarray(clock.load(), float)
+        counts = None if clock.words else np.asarray(clock.load(), float)
         stated_unit = _unit_of_time(clock.name)
-        unit = stated_unit or ("s" if count is None else one_clock.guessed_unit(count))
+        unit = stated_unit or ("s" if counts is None else one_clock.guessed_unit(counts))
         line = f'time_{unit} = "{clock.path}"'
-        if count is not None:
-            elapsed = count * UNITS[unit]
-        if time_signal is None and count is not None:
-            per_count = proposals.seconds_per_count(other_signals, count)
+        if counts is not None:
+            elapsed = counts * UNITS[unit]
+        if time_signal is None and counts is not None:
+            per_count = proposals.seconds_per_count(other_signals, counts)
             question = f"compared with a position, it counts {1 / per_count:.3g} per second"
             if math.isnan(per_count):
                 per_count, question = UNITS[unit], "unit of the counts? give the seconds per count"
             per_count = float(f"{per_count:.3g}")
-            elapsed = count * per_count
+            elapsed = counts * per_count
             line = f'time_s = {{column = "{clock.path}", factor = {per_count:g}}}  # {question}'
         elif not stated_unit and elapsed is not None and unit != "s":
             step = one_clock.usual_step(elapsed)
             line += f"  # unit not stated: in {unit}, rows are {step:.3g} s apart. Check it"
-        if not (clock.name in spelled and clock.name.startswith("time_")):
+        if not (clock.name in known_names and clock.name.startswith("time_")):
             yield clock.path, line
 
-    def seconds(signal: Signal) -> np.ndarray | None:
-        time = elapsed if signal.clock is None else _seconds(signal.clock)
+    def signal_times(signal: Signal) -> np.ndarray | None:
+        time = elapsed if signal.clock is None else _clock_times(signal.clock)
         return None if isinstance(time, str) else time
 
-    yield from proposals.propose_columns(other_signals, spelled, seconds)
+    yield from proposals.propose_columns(other_signals, known_names, signal_times)
 
 
 def _is_rising_count(signal: Signal) -> bool:
     """True if a signal is named like a time counter and rises in nearly every row."""
     if signal.words or not _COUNT.search(signal.name.casefold()):
         return False
-    step = np.diff(np.asarray(signal.load(), float))
-    step = step[np.isfinite(step)]
-    return len(step) > 1 and float(np.mean(step > 0)) > RISING
+    steps = np.diff(np.asarray(signal.load(), float))
+    steps = steps[np.isfinite(steps)]
+    return len(steps) > 1 and float(np.mean(steps > 0)) > RISING

@@ -16,8 +16,8 @@ from mmrjax.model.quantities import CURRENT, RPM, TURN, VOLTAGE
 from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import Robot, turn_error
 
-#: A row counts if the drives of its sides differ by at least this share of the largest drive, or a side is driven
-#: backward by as much [-].
+#: A row counts if the drives of its sides differ by at least this share of the largest drive [-]. It also counts if a
+#: side is driven backward by as much.
 CLEAR = 0.25
 #: Fewest rows that count, and the share of them that must contradict the drive [-].
 FEWEST, MOSTLY = 3, 0.75
@@ -32,8 +32,8 @@ def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None) -> tuple[np.
         volts: voltages of left and right side [V], shape (2, rows).
         supply: shape (rows,).
     """
-    source = np.max(np.abs(volts), 0) if supply is None else supply
-    return source, np.divide(volts, source, out=np.zeros_like(volts), where=source != 0)
+    supply_voltage = np.max(np.abs(volts), 0) if supply is None else supply
+    return supply_voltage, np.divide(volts, supply_voltage, out=np.zeros_like(volts), where=supply_voltage != 0)
 
 
 def with_duties_of_sides(runs: Runs, battery: bool) -> Runs:
@@ -53,15 +53,15 @@ def with_duties_of_sides(runs: Runs, battery: bool) -> Runs:
         )
     check_commands_of_sides(runs, VOLTS, (*SIDES, *DUTY))
     volts = np.stack([runs[c] for c in VOLTS])
-    supply, parts = supply_and_shares(volts, runs.columns.get(SUPPLY))
+    supply, shares = supply_and_shares(volts, runs.columns.get(SUPPLY))
     for side, row in np.argwhere(np.abs(volts) > np.abs(supply) * (1 + ROUNDED))[:1].tolist():
         raise BadData(
             f"{runs.place(row)}, {[*VOLTS][side]}: got {volts[side, row]:g} V at a supply of {supply[row]:g} V; "
             f"expected no more than {SUPPLY}, or remove that column"
         )
-    origin = SUPPLY if runs.has(SUPPLY) else f"{SUPPLY}, the larger of both"
-    note = f"{runs.source}: {' and '.join(VOLTS)} are read as {' and '.join(SIDES)}, shares of {origin}"
-    duties = dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))
+    supply_text = SUPPLY if runs.has(SUPPLY) else f"{SUPPLY}, the larger of both"
+    note = f"{runs.source}: {' and '.join(VOLTS)} are read as {' and '.join(SIDES)}, shares of {supply_text}"
+    duties = dict(zip(SIDES, np.clip(shares, -1.0, 1.0), strict=True))
     return runs.without_columns(VOLTS).with_columns({SUPPLY: supply, **duties}, note)
 
 
@@ -102,19 +102,19 @@ def check_turns(runs: Runs) -> None:
             values, drive = np.stack([runs[c.column] for c in pair]), right - left
             if any(runs.layout.magnitude(c.name) for c in pair):
                 values, drive = np.abs(values), np.abs(right) - np.abs(left)
-            _refuse_against(
+            _reject_opposite_signs(
                 runs, " and ".join(c.column for c in pair), values, values[1] - values[0], drive,
                 "the larger value on the faster side; left and right columns of one quantity are exchanged",
             )  # fmt: skip
     for yaw in (c.column for c in channels.EVERY if c.sign == TURN and runs.has(c.column)):
-        _refuse_against(
+        _reject_opposite_signs(
             runs, yaw, runs[yaw][None], runs[yaw], right - left,
             f"a positive value if the right side is faster: reverse its sign with [columns] {yaw} = {{column, "
             "factor = -1}, or exchange the columns of the sides",
         )  # fmt: skip
 
 
-def _refuse_against(
+def _reject_opposite_signs(
     runs: Runs, column: str, shown: np.ndarray, readings: np.ndarray, drive: np.ndarray, expected: str
 ) -> None:
     """Rejects readings whose sign is mostly opposite to that of their drive. The message names the clearest row.
@@ -256,15 +256,15 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
     back_emf = np.asarray(robot.motor.voltage_back(jnp.asarray(runs[SPEED] * RPM)))
     is_magnitude = runs.layout.magnitude(MAGNITUDES.get(column, "")) or (column == SUPPLY and (voltage > 0).all())
     voltage_forward = np.abs(voltage) if is_magnitude else voltage * np.sign(back_emf)
-    read = CURRENTS if robot.knows(VOLTAGE) else ()
-    current = next((c for c in read if runs.has(c) and not runs.layout.magnitude(CURRENTS[c])), None)
+    current_columns = CURRENTS if robot.knows(VOLTAGE) else ()
+    current = next((c for c in current_columns if runs.has(c) and not runs.layout.magnitude(CURRENTS[c])), None)
     if current is not None:
         motors = float(robot.sides) if current == "total_current_A" else 1.0
         drop = np.nan_to_num(runs[current]) / motors * float(robot.motor.resistance)
         voltage_forward = voltage_forward - drop * np.sign(back_emf)
-    tells = np.abs(back_emf) > LEAST
-    wrong = tells & (voltage_forward < TOO_SMALL * np.abs(back_emf))
-    if wrong.sum() > (0 if current else MOST_BRAKING * np.sum(tells)):
+    compared = np.abs(back_emf) > LEAST
+    wrong = compared & (voltage_forward < TOO_SMALL * np.abs(back_emf))
+    if wrong.sum() > (0 if current else MOST_BRAKING * np.sum(compared)):
         row = int(np.argmax(wrong))
         fault = "with the wrong sign" if voltage_forward[row] < 0 else "too small"
         why = (
@@ -302,7 +302,8 @@ def unwrap_angle(runs: Runs, column: str) -> Runs:
     A position wraps at any length, so it also has to jump against its motion.
     """
     readings, is_angle, unit = runs[column].copy(), column == "output_angle_deg", column.rpartition("_")[2]
-    one, note = "an angle" if is_angle else "a position", ""
+    noun = "an angle" if is_angle else "a position"
+    note = ""
     for name in np.unique(runs.run_names):
         rows = runs.in_order(name)
         rows = rows[np.isfinite(readings[rows])]
@@ -312,20 +313,20 @@ def unwrap_angle(runs: Runs, column: str) -> Runs:
         size = np.abs(step)
         usual = np.maximum(np.median(size), _median_of_neighbours(size))
         is_turn = np.abs(size - 2 * HALF_TURN) <= UNUSUAL * usual
-        large = size > UNUSUAL * usual
+        is_jump = size > UNUSUAL * usual
         if is_angle:
-            returns = np.minimum(*(np.abs(step + np.roll(step, k)) for k in (1, -1))) < HALF_TURN  # a wrong reading
-            large &= (size > HALF_TURN) & ((size < 2 * HALF_TURN + UNUSUAL * usual) | ~returns)
+            is_undone = np.minimum(*(np.abs(step + np.roll(step, k)) for k in (1, -1))) < HALF_TURN  # a wrong reading
+            is_jump &= (size > HALF_TURN) & ((size < 2 * HALF_TURN + UNUSUAL * usual) | ~is_undone)
         else:
-            large &= (size > np.ptp(readings[rows]) / 2) & (step * _median_of_neighbours(step) < 0)
-        if not large.any():
+            is_jump &= (size > np.ptp(readings[rows]) / 2) & (step * _median_of_neighbours(step) < 0)
+        if not is_jump.any():
             continue
-        jump, time_steps = int(np.argmax(large)), np.diff(runs["time_s"][rows])
+        jump, time_steps = int(np.argmax(is_jump)), np.diff(runs["time_s"][rows])
         place = f"{runs.place(rows[jump + 1])}, {column}"
-        why = f"like {one} that wraps or changes its unit; expected {one} that keeps counting"
+        why = f"like {noun} that wraps or changes its unit; expected {noun} that keeps counting"
         if time_steps[jump] > GAP * np.median(time_steps):
             why = f"{float(f'{time_steps[jump]:.3g}'):g} s earlier; give each recording its own run_id"
-        elif is_angle and is_turn[large].all():
+        elif is_angle and is_turn[is_jump].all():
             readings[rows] = np.unwrap(readings[rows], period=2 * HALF_TURN)
             note = f"{place}: wraps at {2 * HALF_TURN:g} {unit}. The wraps are removed"
             continue

@@ -52,7 +52,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     content = input_files.csv_bytes(path, name)
     if len(content) >= LONG and (plain := _read_plain_table(name, content)) is not None:
         return plain
-    text, encoded = decode_text(name, content)
+    text, encoding_notes = decode_text(name, content)
     input_files.check_memory(name, CELL * sum(text.count(mark) for mark in (",", *SEPARATORS)))
     rows, notes = split_cells(name, drop_comments([line for line in text.splitlines() if line.strip()]))
     header, *body = rows or [[]]
@@ -67,7 +67,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
         tuple(column or f"column {k}" for k, column in enumerate(header, 1)),
         tuple(map(list, zip(*body, strict=True))) or tuple([] for _ in header),
         units,
-        notes=(*encoded, *notes),
+        notes=(*encoding_notes, *notes),
         digest=hashlib.sha256(content).hexdigest(),
     )
 
@@ -87,11 +87,15 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
 
     A plain table is in UTF-8 with commas, without comments, quotes and units.
     """
-    end = content.find(b"\n")
-    if content.startswith((b"#", b"%", codecs.BOM_UTF8, b"\xff\xfe", b"\xfe\xff")) or b'"' in content or end < 0:
+    header_end = content.find(b"\n")
+    if (
+        content.startswith((b"#", b"%", codecs.BOM_UTF8, b"\xff\xfe", b"\xfe\xff"))
+        or b'"' in content
+        or header_end < 0
+    ):
         return None
     try:
-        first_lines = content[: content.find(b"\n", end + 1)].decode().splitlines()
+        first_lines = content[: content.find(b"\n", header_end + 1)].decode().splitlines()
     except UnicodeDecodeError:
         return None
     input_files.check_declared(name, first_lines[0].count(",") + 1)
@@ -103,18 +107,18 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
     from pyarrow import csv as reader
 
     names = [str(k) for k in range(len(header))]
-    kinds = reader.ConvertOptions(column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False)
+    conversion = reader.ConvertOptions(column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False)
     try:
         table = reader.read_csv(
             pa.BufferReader(pa.py_buffer(content)),
             reader.ReadOptions(column_names=names, skip_rows=1),
             reader.ParseOptions(quote_char=False),
-            kinds,
+            conversion,
         )
     except pa.ArrowInvalid:  # a row of different length, or bytes that are not UTF-8
         return None
-    blank = [compute.equal(column, "") for column in table.columns]
-    if compute.any(functools.reduce(compute.and_, blank)).as_py():  # rows with only separators
+    is_blank = [compute.equal(column, "") for column in table.columns]
+    if compute.any(functools.reduce(compute.and_, is_blank)).as_py():  # rows with only separators
         return None
     values: list[Raw] = []
     for column in table.columns:
@@ -195,9 +199,9 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
         BadData: the text is no CSV, a column has both decimal commas and points, or a mark may separate thousands.
     """
     header = lines[0] if lines else ""
-    mark = next((m for m in SEPARATORS if m in header and "," not in header), ",")
+    separator = next((m for m in SEPARATORS if m in header and "," not in header), ",")
     try:
-        rows = [[cell_word(cell.strip()) for cell in row] for row in csv.reader(lines, delimiter=mark)]
+        rows = [[cell_word(cell.strip()) for cell in row] for row in csv.reader(lines, delimiter=separator)]
     except csv.Error as error:
         raise BadData(
             f"{name}: cannot be read as CSV ({error}); look for a quotation mark that is not closed, or a cell of "
@@ -207,20 +211,22 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
     header_width = max((j + 1 for j, cell in enumerate(rows[0]) if cell), default=0) if rows else 0
     if not any(any(row[header_width:]) for row in rows):  # separators at the ends of lines
         rows = [row[:header_width] for row in rows]
-    if mark == ",":
+    if separator == ",":
         return rows, ()
-    note = f"{name}: columns are separated by {SEPARATORS[mark]}"
+    note = f"{name}: columns are separated by {SEPARATORS[separator]}"
     columns = list(itertools.zip_longest(*rows[1:], fillvalue=""))
     titles = [*rows[0], *["a column"] * len(columns)]
-    commas, points, below = ([[*filter(x.fullmatch, column)] for column in columns] for x in (_COMMA, _POINT, _BELOW))
+    commas, points, small_numbers = (
+        [[*filter(x.fullmatch, column)] for column in columns] for x in (_COMMA, _POINT, _BELOW)
+    )
     expectation = "expected decimal commas or decimal points, without thousands separators"
     for title, comma, point in zip(titles, commas, points, strict=False):
         if comma and point:
             raise BadData(f"{name}, {title}: got {comma[0]} and {point[0]}; {expectation}")
     for marked, other in ((points, commas), (commas, points)):
         elsewhere = next((f"{cells[0]} in {title}" for title, cells in zip(titles, other, strict=False) if cells), "")
-        for title, written, small in zip(titles, marked, below, strict=False):
-            if written and (elsewhere or small) and all(map(_THOUSANDS.fullmatch, written)):
+        for title, written, numbers_below in zip(titles, marked, small_numbers, strict=False):
+            if written and (elsewhere or numbers_below) and all(map(_THOUSANDS.fullmatch, written)):
                 raise BadData(
                     f"{name}, {title}: got {written[0]} next to {elsewhere or 'whole numbers below a thousand'}; "
                     f"{expectation}"

@@ -33,16 +33,16 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
 
 
-def _effect_that_records_signals(place: str, whose: str, seen: list[Signals]) -> Effect:
+def _effect_that_records_signals(balance_name: str, channel_name: str, recorded: list[Signals]) -> Effect:
     """Effect without influence that records the signals which its balance passes to it."""
 
     class Witness(Effect):
-        balance = place
-        channel = whose
+        balance = balance_name
+        channel = channel_name
         amplitude: Scalar = 0.0
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
-            seen.append(signals)
+            recorded.append(signals)
             return 0.0
 
     return Witness()
@@ -59,10 +59,10 @@ def readable_signals(
             (`balances.moving_signals`).
     """
     signals_read: list[Signals] = []
-    watched = replace(robot, effects=(_effect_that_records_signals(balance, channel, signals_read),))
-    order = balances.settled_signals if settled else balances.moving_signals
-    signals = order(watched, conditions, state)
-    balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
+    watched_robot = replace(robot, effects=(_effect_that_records_signals(balance, channel, signals_read),))
+    compute_signals = balances.settled_signals if settled else balances.moving_signals
+    signals = compute_signals(watched_robot, conditions, state)
+    balances.sensor(watched_robot, signals[0] if isinstance(signals, tuple) else signals)
     return signals_read[-1]  # at the torque that a gearbox really transmits, which is iterated
 
 
@@ -107,15 +107,17 @@ def effect_library(paths: Sequence[Path | str]) -> Library:
             unknown effect.
     """
     library = dict(effects.BY_NAME)
-    own_effects = [(path, effect) for path in map(Path, paths) for effect in read_effect_file(path)]
-    for path, effect in own_effects:
+    user_effects = [(path, effect) for path in map(Path, paths) for effect in read_effect_file(path)]
+    for path, effect in user_effects:
         if effect.name in {**effects.BESIDE, **library}:
-            raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is already used; choose another")
+            raise BadConfiguration(
+                f"{_effect_place(path, effect)}, name: {effect.name} is already used; choose another"
+            )
         library[effect.name] = effect
-    for path, effect in own_effects:
+    for path, effect in user_effects:
         other_names = [name for name in library if name != effect.name]
         if effect.settles_to:
-            stated_word(effect.settles_to, other_names, f"{_where(path, effect)}, settles_to")
+            stated_word(effect.settles_to, other_names, f"{_effect_place(path, effect)}, settles_to")
     return library
 
 
@@ -150,8 +152,8 @@ def read_effect_file(path: Path) -> tuple[type[Effect], ...]:
         raise BadConfiguration(f"{path.name}: its code fails ({type(error).__name__}: {error})") from error
     concrete = effects.effects_of_module(module)
     if not concrete:
-        own_classes = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == name]
-        partial = [v.__name__ for v in own_classes if issubclass(v, Effect)]
+        classes = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == name]
+        partial = [v.__name__ for v in classes if issubclass(v, Effect)]
         missing = f"; {partial[0]} defines no term" if partial else ""
         raise BadConfiguration(
             f"{path.name}: contains no effect; expected a class derived from mmrjax.effects.Effect{missing}"
@@ -161,12 +163,12 @@ def read_effect_file(path: Path) -> tuple[type[Effect], ...]:
     return concrete
 
 
-def _where(path: Path, effect: type[Effect]) -> str:
+def _effect_place(path: Path, effect: type[Effect]) -> str:
     return f"{path.name}, {effect.__name__}"
 
 
 def _check_effect(path: Path, effect: type[Effect]) -> None:
-    effect_place = _where(path, effect)
+    effect_place = _effect_place(path, effect)
 
     def refuse(what: str) -> BadConfiguration:
         return BadConfiguration(f"{effect_place}{what}")
@@ -226,19 +228,20 @@ def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signal
     """Signals of the nominal robot on its battery, for the test of the terms of effects.
 
     Returns:
-        Signals that a term of the left side may read while the robot climbs and turns left, all signals at that
-        point, and the signals that a term may read at rest.
+        Signals that a term of the left side may read while the robot climbs and turns left. All signals at that
+        point. Signals that a term may read at rest.
     """
     robot = paper_robots.nominal()
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)
     zero = jnp.zeros(())
     climbing = State(jnp.asarray(1.5), jnp.asarray(800.0), jnp.asarray(0.6), jnp.asarray(100.0))
-    state_at_rest = State(zero, zero, zero, zero)
+    at_rest = State(zero, zero, zero, zero)
     # Sums for the turn are computed after both sides' slip and resistance.
-    before = "slip" if balance in ROUND else balance
-    climbs, points = readable_signals(robot, run, climbing, before, channel), moving_signals(robot, run, climbing)
-    signals_at_rest = readable_signals(robot, run, state_at_rest, before, channel)
-    return replace(climbs, **TURN), replace(points, **TURN), signals_at_rest
+    read_balance = "slip" if balance in ROUND else balance
+    readable = readable_signals(robot, run, climbing, read_balance, channel)
+    all_signals = moving_signals(robot, run, climbing)
+    readable_at_rest = readable_signals(robot, run, at_rest, read_balance, channel)
+    return replace(readable, **TURN), replace(all_signals, **TURN), readable_at_rest
 
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
@@ -248,48 +251,50 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
     def term(amplitude: jax.Array, signals: Signals) -> jax.Array:
         # The robot file checks configurations that the nominal robot does not have.
         effect_of_amplitude = replace(params.replace(effect(), {"amplitude": amplitude}), configurations=())
-        with_it = replace(robot, effects=(effect_of_amplitude,))
-        return jnp.asarray(effects_sum(with_it, signals, effect.balance, effect.channel), float)
+        robot_with_effect = replace(robot, effects=(effect_of_amplitude,))
+        return jnp.asarray(effects_sum(robot_with_effect, signals, effect.balance, effect.channel), float)
 
     for configuration in range(len(robot.configurations)):
-        known, points, points_at_rest = (
+        readable, all_signals, signals_at_rest = (
             replace(s, memory=memory) for s in _test_points(effect.balance, effect.channel, configuration)
         )
-        mirrored = replace(known, **{name: -value for name, value in TURN.items()})
-        external = replace(known, battery=jnp.zeros(()))
+        mirrored = replace(readable, **{name: -value for name, value in TURN.items()})
+        on_external_supply = replace(readable, battery=jnp.zeros(()))
         try:
-            term_at_zero, term_at_size, term_at_double = (term(jnp.asarray(k * size), known) for k in (0.0, 1.0, 2.0))
-            term_of_external_supply, fed = (term(jnp.asarray(size), s) for s in (points, external))
-            other = term(jnp.asarray(size), mirrored) * (-1 if effect.balance in ROUND else 1)
-            slope = jax.grad(lambda a, s=known: jnp.sum(term(a, s)))(jnp.asarray(0.0))
-            at_rest = eqx.filter_grad(lambda s: jnp.sum(term(jnp.asarray(size), s)))(points_at_rest)
+            term_at_zero, term_at_size, term_at_double = (
+                term(jnp.asarray(k * size), readable) for k in (0.0, 1.0, 2.0)
+            )
+            term_of_all, external_term = (term(jnp.asarray(size), s) for s in (all_signals, on_external_supply))
+            mirrored_term = term(jnp.asarray(size), mirrored) * (-1 if effect.balance in ROUND else 1)
+            slope = jax.grad(lambda a, s=readable: jnp.sum(term(a, s)))(jnp.asarray(0.0))
+            gradient_at_rest = eqx.filter_grad(lambda s: jnp.sum(term(jnp.asarray(size), s)))(signals_at_rest)
             memory_rates = []
             if effect.memory_size is not None:
-                memory_rates = [effect().rate(robot, points), effect().settled(robot, known)]
+                memory_rates = [effect().rate(robot, all_signals), effect().settled(robot, readable)]
         except (Exception, SystemExit) as error:
             raise refuse(f": its term cannot be computed ({type(error).__name__}: {error})") from error
         if term_at_size.shape != ():
             raise refuse(f": its term has shape {term_at_size.shape}; expected a scalar for scalar signals")
-        if not jnp.array_equal(term_at_size, term_of_external_supply, equal_nan=True):
+        if not jnp.array_equal(term_at_size, term_of_all, equal_nan=True):
             raise refuse(": its term reads a signal that is computed after its balance; see balances.moving_signals")
         if float(term_at_zero) != 0.0:
             raise refuse(f": its term is {float(term_at_zero):g} at amplitude 0; expected 0")
         if not math.isfinite(float(slope)):
             raise refuse(f": the derivative of its term at amplitude 0 is {float(slope)}; expected a finite one")
-        bent = abs(float(term_at_double) - 2 * float(term_at_size)) > 1e-6 * abs(float(term_at_double))
-        if bent or (float(slope) == 0) != (float(term_at_size) == 0):
+        is_nonlinear = abs(float(term_at_double) - 2 * float(term_at_size)) > 1e-6 * abs(float(term_at_double))
+        if is_nonlinear or (float(slope) == 0) != (float(term_at_size) == 0):
             raise refuse(
                 ": its term is not proportional to its amplitude; expected amplitude times a function of signals"
             )
         if not all(math.isfinite(float(jnp.sum(x))) for x in memory_rates):
             raise refuse(": the rate or settled value of its memory is not finite")
-        if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(at_rest)):
+        if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(gradient_at_rest)):
             raise refuse(": derivatives of its term are not finite at rest, where drive and track start")
-        alike = effect.balance == "sensor" or jnp.allclose(term_at_size, other, rtol=1e-9, atol=0.0)
-        if not alike and effect.driver != THE_SIDE:
+        is_symmetric = effect.balance == "sensor" or jnp.allclose(term_at_size, mirrored_term, rtol=1e-9, atol=0.0)
+        if not is_symmetric and effect.driver != THE_SIDE:
             raise refuse(
                 f", driver: got {effect.driver!r} for a term that differs between the sides; expected "
                 f'"{THE_SIDE}", since the robot turns unless it is steered'
             )
-        if effect.needs_battery and float(fed) != 0.0:
-            raise refuse(f", needs_battery: its term is {float(fed):g} on an external supply; expected 0")
+        if effect.needs_battery and float(external_term) != 0.0:
+            raise refuse(f", needs_battery: its term is {float(external_term):g} on an external supply; expected 0")

@@ -42,13 +42,14 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, tuple[float, float, flo
     total, payload = runs["total_mass_kg"], runs["payload_kg"]
     robot_mass = total - payload
     low, high = params.parameters_by_name(robot.configurations.members[0])["mass"].spec.bounds
-    end = f"expected {low:g} to {high:g} kg without the payload"
-    why = lambda row: f" with a payload of {payload[row]:g} kg; {end}"  # noqa: E731
+    expectation = f"expected {low:g} to {high:g} kg without the payload"
+    why = lambda row: f" with a payload of {payload[row]:g} kg; {expectation}"  # noqa: E731
     runs.check_rows([("total_mass_kg", (robot_mass < low) | (robot_mass > high), why)])
     masses = {}
     for index in np.unique(configuration_index):
         rows = configuration_index == index
-        m, constant = robot_mass[rows], bool(np.ptp(total[rows]) <= MASS_ROUNDING)
+        m = robot_mass[rows]
+        constant = bool(np.ptp(total[rows]) <= MASS_ROUNDING)
         median = round(float(np.median(m)), 6)
         masses[robot.configurations.names[index]] = (median, float(m.min()), float(m.max()), constant)
     return masses
@@ -60,8 +61,8 @@ def with_table_mass(robot: Robot, runs: Runs) -> Robot:
     Raises:
         BadData: for the same reasons as `stated_masses`.
     """
-    own_masses = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
-    masses = {n: m for n, (m, *_) in stated_masses(robot, runs).items() if abs(m - own_masses[n]) > MASS_ROUNDING}
+    robot_masses = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
+    masses = {n: m for n, (m, *_) in stated_masses(robot, runs).items() if abs(m - robot_masses[n]) > MASS_ROUNDING}
     return params.replace(robot, {f"{name}.mass": jnp.asarray(mass, float) for name, mass in masses.items()})
 
 
@@ -75,10 +76,10 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     for name, (median, low, high, constant) in stated_masses(robot, runs).items():
         mass = float(robot.configurations[name].mass)
         if high - low > MASS_ROUNDING:
-            why = "; does total_mass_kg exclude the payload?" * constant
+            question = "; does total_mass_kg exclude the payload?" * constant
             notes.append(
                 f"{name}: total_mass_kg minus payload_kg varies from {low:.4g} to {high:.4g} kg. robot.toml "
-                f"contains the median, {median:.4g} kg, so it does not reproduce the fit in other rows{why}"
+                f"contains the median, {median:.4g} kg, so it does not reproduce the fit in other rows{question}"
             )
         elif abs(median - mass) > MASS_ROUNDING:
             notes.append(
@@ -86,8 +87,8 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
                 f"kg. {median:.6g} kg is used, and written to robot.toml"
             )
     if runs.has("surface"):
-        of_table5 = rows_of_scaled_adhesion(robot, runs["configuration"], runs["surface"])
-        others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH]
+        is_labelled = rows_of_scaled_adhesion(robot, runs["configuration"], runs["surface"])
+        others = [s for s in np.unique(runs["surface"][is_labelled]) if s != BENCH]
         if others:
             notes.append(
                 f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}. Simulate with "
@@ -140,8 +141,8 @@ def common_step(readings: np.ndarray) -> float:
         step = a
         if step < SMALLEST * largest:
             return 0.0
-    ladder = largest < (levels.size + 0.5) * step and np.min(np.abs(levels)) < 1.5 * step
-    return 0.0 if ladder and np.ptp(counts) == 0 else step
+    is_ladder = largest < (levels.size + 0.5) * step and np.min(np.abs(levels)) < 1.5 * step
+    return 0.0 if is_ladder and np.ptp(counts) == 0 else step
 
 
 def display_step(readings: np.ndarray, channel: Channel) -> float:
@@ -160,8 +161,8 @@ def display_step(readings: np.ndarray, channel: Channel) -> float:
         return step
     largest = float(np.max(np.abs(levels)))
     powers = 10.0 ** np.arange(math.floor(math.log10(COARSEST * largest)), math.log10(SMALLEST * largest), -1)
-    fits = [p for p in powers if np.all(np.abs(levels / p - np.round(levels / p)) < 1e-6)]
-    return float(fits[0] * channel.factor) if fits else 0.0
+    fitting_powers = [p for p in powers if np.all(np.abs(levels / p - np.round(levels / p)) < 1e-6)]
+    return float(fitting_powers[0] * channel.factor) if fitting_powers else 0.0
 
 
 def infer_instruments(runs: Runs) -> Runs:
@@ -186,10 +187,10 @@ def infer_instruments(runs: Runs) -> Runs:
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
     """Robot with the instruments inferred from its table."""
-    of_rig, of_table = robot.rig.instruments, runs.layout.instruments
-    instruments = of_table if any(i.free for i in of_rig) else of_rig
+    rig_instruments, table_instruments = robot.rig.instruments, runs.layout.instruments
+    instruments = table_instruments if any(i.free for i in rig_instruments) else rig_instruments
     measured_channels = {i.channel for i in instruments}
-    instruments = (*instruments, *(i for i in of_table if i.channel not in measured_channels))
-    if instruments == of_rig:
+    instruments = (*instruments, *(i for i in table_instruments if i.channel not in measured_channels))
+    if instruments == rig_instruments:
         return robot
     return replace(robot, rig=replace(robot.rig, instruments=instruments))

@@ -141,8 +141,8 @@ def available_memory() -> float:
             import resource
 
             limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-            pages_bytes = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
-            free = free if limit == resource.RLIM_INFINITY else min(free, float(limit - pages_bytes))
+            used_bytes = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
+            free = free if limit == resource.RLIM_INFINITY else min(free, float(limit - used_bytes))
         return free
     except (ValueError, OSError, AttributeError):
         return math.inf
@@ -206,17 +206,17 @@ def toml_content(text: str, where: str | Path) -> Json:
         raise BadConfiguration(f"{where}: not a readable TOML file ({error})") from error
     except RecursionError as error:
         raise BadConfiguration(too_deep) from error
-    keys = 0
+    key_count = 0
     pending: list[tuple[Json | list[Any], int]] = [(content, 1)]
     while pending:
         value, depth = pending.pop()
         if depth > DEEPEST:
             raise BadConfiguration(too_deep)
-        inner = value.values() if isinstance(value, dict) else value
-        keys += len(value) if isinstance(value, dict) else 0
-        if keys > KEYS:
+        items = value.values() if isinstance(value, dict) else value
+        key_count += len(value) if isinstance(value, dict) else 0
+        if key_count > KEYS:
             raise BadConfiguration(f"{where}: has more than {count_noun(KEYS, 'key')}; is it the right file?")
-        for item in inner:
+        for item in items:
             if isinstance(item, dict | list):
                 pending.append((item, depth + 1))
             elif isinstance(item, int) and not -WHOLE <= item < WHOLE:

@@ -116,8 +116,6 @@ def check_rows(name: str, columns: Mapping[str, np.ndarray], checks: Iterable[Ch
     for column, wrong, why in checks:
         for row in np.flatnonzero(wrong)[:1].tolist():
             value = columns[column][row]
-            cell, end = (
-                "an empty cell" if np.isnan(value) else f"{value:g}",
-                why if isinstance(why, str) else why(row),
-            )
+            cell = "an empty cell" if np.isnan(value) else f"{value:g}"
+            end = why if isinstance(why, str) else why(row)
             raise BadData(f"{name} row {row + 1}, {column}: got {cell}{end}")

@@ -143,8 +143,9 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
     """Writes a posterior as NetCDF 3, which `xarray.open_dataset` reads with units and long names."""
     from scipy.io import netcdf_file
 
-    p, square = posterior, ("coordinate", "coordinate_2")
-    words_by_name = {
+    p = posterior
+    square = ("coordinate", "coordinate_2")
+    long_names = {
         "mean": "of z",
         "location": "u at z = 0, the parameter or its logarithm",
         "spread": "du/dz",
@@ -160,7 +161,7 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
         file.schema = SCHEMA
         file.title = "posterior of a calibrated robot, normal in z: u = location + spread z"
 
-        def put(name: str, values: Any, kind: str, words: str, *dimensions: str) -> None:
+        def write_variable(name: str, values: Any, kind: str, long_name: str, *dimensions: str) -> None:
             values = np.asarray([x.encode() for x in values] if kind == "S" else values, kind)
             if kind == "S":  # strings as rows of characters
                 dimensions = (*dimensions, f"string{values.itemsize}")
@@ -170,20 +171,20 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
                     file.createDimension(dimension, size)
             variable = file.createVariable(name, values.dtype, dimensions)
             variable[:] = values
-            if words:
-                variable.long_name = words
+            if long_name:
+                variable.long_name = long_name
 
-        put("coordinate", p.coordinates, "S", "", "coordinate")
-        for name, words in words_by_name.items():
+        write_variable("coordinate", p.coordinates, "S", "", "coordinate")
+        for name, long_name in long_names.items():
             values = computed[name] if name in computed else getattr(p, name)
-            put(name, values, "f8", words, *square[: np.ndim(values)])
-        put("kind", p.kinds, "S", "transformation of u", "coordinate")
-        put("units", p.units, "S", "of the parameter", "coordinate")
+            write_variable(name, values, "f8", long_name, *square[: np.ndim(values)])
+        write_variable("kind", p.kinds, "S", "transformation of u", "coordinate")
+        write_variable("units", p.units, "S", "of the parameter", "coordinate")
         if p.tied:
             followers, indices, ratios = zip(*p.tied, strict=True)
-            put("tied", followers, "S", "follows another", "follower")
-            put("tied_to", indices, "i4", "its index", "follower")
-            put("tied_ratio", ratios, "f8", "ratio to that", "follower")
+            write_variable("tied", followers, "S", "follows another", "follower")
+            write_variable("tied_to", indices, "i4", "its index", "follower")
+            write_variable("tied_ratio", ratios, "f8", "ratio to that", "follower")
 
 
 def read_posterior(path: Path | str) -> Posterior:

@@ -49,9 +49,9 @@ class PresetColumn:
     """A column of this program, and the column of a logger's file from which it is read.
 
     Attributes:
-        mine: name of the column in this program.
-        theirs: possible names in the file, `*` for any text. The first name in the file is used.
-        factor: factor from its unit to the unit of `mine`.
+        column: name of the column in this program.
+        source_columns: possible names in the file, `*` for any text. The first name in the file is used.
+        factor: factor from its unit to the unit of `column`.
         note: its meaning, for a note to the user.
         needs: another column of this program that is required if this one drives the motor. Empty: none.
         across: column of the file with the d-axis current, which field weakening makes nonzero. Empty: none.
@@ -59,8 +59,8 @@ class PresetColumn:
         zero: raw number that means zero.
     """
 
-    mine: str
-    theirs: Names
+    column: str
+    source_columns: Names
     factor: float = 1.0
     note: str = ""
     needs: str = ""
@@ -84,30 +84,30 @@ class Preset:
     header: Names = ()
 
     def mapped(
-        self, found: Callable[[str], str | None], has_readings: Callable[[str], bool] = lambda name: True
+        self, find_column: Callable[[str], str | None], has_readings: Callable[[str], bool] = lambda name: True
     ) -> tuple[Mapped, Names]:
         """Columns of a source in the form of `Layout.mapped`, and notes on their meaning.
 
         Args:
-            found: function that returns the source column with a name, or None.
+            find_column: function that returns the source column with a name, or None.
             has_readings: function that returns False for an empty source column.
         """
         mapped, notes = [], []
         for column in self.columns:
-            present = [name for name in map(found, column.theirs) if name is not None]
+            present = [name for name in map(find_column, column.source_columns) if name is not None]
             if present:
                 name = next(filter(has_readings, present), present[0]) if len(present) > 1 else present[0]
-                mapped.append((column.mine, name, column.factor))
+                mapped.append((column.column, name, column.factor))
                 if column.note:
-                    notes.append(f"{self.name}: {name}, read as {column.mine}, {column.note}")
+                    notes.append(f"{self.name}: {name}, read as {column.column}, {column.note}")
             elif self.name not in PACKAGED:  # packaged presets have columns of several loggers
-                mapped.append((column.mine, column.theirs[0], column.factor))
+                mapped.append((column.column, column.source_columns[0], column.factor))
         return tuple(mapped), tuple(notes)
 
     def column_of(self, name: str) -> PresetColumn:
         """Preset column that is read from a source column, or an empty one."""
-        read = (c for c in self.columns if any(_matches_any(pattern, {name}) for pattern in c.theirs))
-        return next(read, PresetColumn("", ()))
+        columns = (c for c in self.columns if any(_matches_any(pattern, {name}) for pattern in c.source_columns))
+        return next(columns, PresetColumn("", ()))
 
     def check_needed(self, mapped: Mapped, imposed: str, name: str) -> None:
         """Rejects a source that lacks a column without which its imposed column is useless.
@@ -120,10 +120,10 @@ class Preset:
         Raises:
             BadData: the other column is missing.
         """
-        present = {own_column: pattern for own_column, pattern, _ in mapped}
-        by_name = {column.mine: column for column in self.columns}
+        present = {name: source_column for name, source_column, _ in mapped}
+        by_name = {column.column: column for column in self.columns}
         if imposed in present and (needs := by_name[imposed].needs) and needs not in present:
-            missing_words = " or ".join(by_name[needs].theirs)
+            missing_words = " or ".join(by_name[needs].source_columns)
             raise BadData(
                 f"{name}: has no {missing_words}; --columns {self.name} needs it for {needs}, because "
                 f"{present[imposed]} alone does not give the motor voltage; record {missing_words}, or set imposed "
@@ -144,9 +144,9 @@ def find_preset(stated: str | Path) -> Preset:
     Raises:
         BadConfiguration: there is no such preset or file, a number is missing or unknown, or as in `parse_preset`.
     """
-    name, *others = str(stated).split(SEPARATOR)
+    name, *entries = str(stated).split(SEPARATOR)
     numbers: dict[str, float] = {}
-    for entry in others:
+    for entry in entries:
         key, equals, text = (part.strip() for part in entry.partition("="))
         try:
             numbers[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
@@ -171,16 +171,16 @@ def recognise_preset(names: Sequence[str]) -> str:
     Args:
         names: names of the source's columns, or paths of its signals.
     """
-    ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
+    parts = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
     matches = {"": OF_A_PRESET - 1}
     for name in PACKAGED:
         preset = parse_preset(_packaged_content(name), name, dict.fromkeys(numbers_to_state(name), 1.0))
-        matches[name] = sum(any(_matches_any(pattern, ends) for pattern in c.theirs) for c in preset.columns)
+        matches[name] = sum(any(_matches_any(pattern, parts) for pattern in c.source_columns) for c in preset.columns)
     return max(matches, key=lambda name: matches[name])
 
 
-def _matches_any(theirs: str, names: set[str]) -> bool:
-    return bool(fnmatch.filter(names, theirs)) if "*" in theirs else theirs in names
+def _matches_any(pattern: str, names: set[str]) -> bool:
+    return bool(fnmatch.filter(names, pattern)) if "*" in pattern else pattern in names
 
 
 def numbers_to_state(name: str) -> Names:
@@ -231,24 +231,24 @@ def parse_columns(
     """
     layout, columns = Layout(channels=channels.EVERY), []
     spellings = layout.spellings()
-    for own_column, patterns in table.items():
-        place = f"{where}, columns.{own_column}"
-        if own_column not in spellings:
-            names_text = allowed_words(own_column, spellings, listed=layout.known())
+    for name, entry in table.items():
+        place = f"{where}, columns.{name}"
+        if name not in spellings:
+            names_text = allowed_words(name, spellings, listed=layout.known())
             raise BadConfiguration(f"{place}: no such column of a table; {names_text}; other units are allowed too")
-        columns.append(_parse_column(own_column, patterns, place, keys, numbers))
+        columns.append(_parse_column(name, entry, place, keys, numbers))
     return tuple(columns)
 
 
-def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
+def _preset_numbers(questions: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
     """Numbers that the user gives for a preset, or their defaults, by name."""
-    stated_as(asked, dict, f"{where}, ask", "a table")
+    stated_as(questions, dict, f"{where}, ask", "a table")
     for key in given:
-        if key not in asked:
-            names_text = allowed_words(key, asked) if asked else "it defines no numbers under [ask]"
+        if key not in questions:
+            names_text = allowed_words(key, questions) if questions else "it defines no numbers under [ask]"
             raise BadConfiguration(f"--columns {where}: got {key}; {names_text}")
     numbers: dict[str, float] = {}
-    for key, number in asked.items():
+    for key, number in questions.items():
         table = {"about": number} if isinstance(number, str) else number
         if not isinstance(table, dict) or {*table} - {*KEYS_OF_NUMBER} or not isinstance(table.get("about"), str):
             raise BadConfiguration(
@@ -267,14 +267,16 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
 
 
 def _parse_column(
-    mine: str, theirs: Any, where: str, keys: Sequence[str], numbers: Mapping[str, float]
+    name: str, entry: Any, where: str, keys: Sequence[str], numbers: Mapping[str, float]
 ) -> PresetColumn:
-    form = f'{mine} = "LOGGER COLUMN", or {mine} = {{column = "LOGGER COLUMN", factor = 0.001}}'
-    table = theirs if isinstance(theirs, dict) else {"column": theirs}
+    form = f'{name} = "LOGGER COLUMN", or {name} = {{column = "LOGGER COLUMN", factor = 0.001}}'
+    table = entry if isinstance(entry, dict) else {"column": entry}
     for key in table:
         stated_word(key, keys, where, f"got the key {key}")
-    column = table.get("column") if keys is KEYS_OF_COLUMN else stated_as(table.get("column"), str, where, form)
-    names = stated_names([column] if isinstance(column, str) else column, f"{where}.column", form)
+    column, place = table.get("column"), f"{where}.column"
+    if keys is not KEYS_OF_COLUMN:
+        stated_as(column, str, place, form)
+    patterns = stated_names([column] if isinstance(column, str) else column, place, form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
     for key, power in (("per", -1), ("times", 1)):
         if key in table:
@@ -288,8 +290,8 @@ def _parse_column(
     texts = {key: stated_as(table.get(key, ""), str, f"{where}.{key}", expected) for key, expected in TEXTS.items()}
     sign_bit = stated_count(table.get("sign_bit", 0), f"{where}.sign_bit", 0, 63)
     zero = stated_number(table.get("zero", 0.0), f"{where}.zero")
-    theirs = tuple(_fill_in_numbers(name, numbers) for name in names)
-    return PresetColumn(mine, theirs, factor, sign_bit=sign_bit, zero=zero, **texts)
+    source_columns = tuple(_fill_in_numbers(pattern, numbers) for pattern in patterns)
+    return PresetColumn(name, source_columns, factor, sign_bit=sign_bit, zero=zero, **texts)
 
 
 def _fill_in_numbers(name: str, numbers: Mapping[str, float]) -> str:
@@ -302,14 +304,12 @@ def _fill_in_numbers(name: str, numbers: Mapping[str, float]) -> str:
 def merge_columns(first: Mapped, others: Mapped) -> Mapped:
     """Columns of two tables. `first` takes precedence if both state a column or read the same source column."""
     first = tuple(first)
-    used_names = {_name_without_unit(own_column) for own_column, _, _ in first} | {
-        source_column for _, source_column, _ in first
-    }
+    used_names = {_name_without_unit(name) for name, _, _ in first} | {source for _, source, _ in first}
     return (*first, *(c for c in others if _name_without_unit(c[0]) not in used_names and c[1] not in used_names))
 
 
-def _name_without_unit(mine: str) -> str:
+def _name_without_unit(name: str) -> str:
     """Name of a column without its unit: time_ms and time_s become equal."""
     layout = Layout(channels=channels.EVERY)
     quantities = layout.quantities()
-    return next((column for column, quantity in quantities.items() if mine in quantity.columns()), mine)
+    return next((column for column, quantity in quantities.items() if name in quantity.columns()), name)

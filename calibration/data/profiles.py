@@ -153,11 +153,11 @@ class ProfileTable:
         Raises:
             BadConfiguration: the profile states a voltage, but the battery feeds the motors.
         """
-        instead = {
+        alternatives = {
             "voltage_left": "voltage_left_V; give duty_left and duty_right instead",
             "voltage": "supply_voltage_V; use one of the two",
         }
-        for field, cure in instead.items():
+        for field, cure in alternatives.items():
             if battery and field in self.values:
                 raise BadConfiguration(f"--battery cannot be combined with {self.source}, which gives {cure}")
 
@@ -171,7 +171,7 @@ class ProfileTable:
         Returns:
             Fields of shape (rows,). If it states surfaces, `adhesion` has the shape (runs, rows).
         """
-        made = profile(
+        simulated_profile = profile(
             self.time,
             self.modes,
             demand=self.demand,
@@ -180,7 +180,7 @@ class ProfileTable:
             **self.values,
         )
         if self.surface is None:
-            return made
+            return simulated_profile
         is_tracked = robot.configurations.tracked[np.asarray(conditions.configuration)].astype(int)
 
         def ratio_by_surface(ratio: Callable[[str, bool], float]) -> Array:
@@ -190,7 +190,9 @@ class ProfileTable:
             )
 
         lateral = ratio_by_surface(lateral_ratio) if self.turns else None
-        return dataclasses.replace(made, adhesion=ratio_by_surface(adhesion_ratio), adhesion_lateral=lateral)
+        return dataclasses.replace(
+            simulated_profile, adhesion=ratio_by_surface(adhesion_ratio), adhesion_lateral=lateral
+        )
 
 
 def read_profile(source: str | Path) -> ProfileTable:
@@ -217,7 +219,8 @@ def _profile_of_file(path: Path, signal_path: str, name: str) -> ProfileTable:
         text, _ = delimited.decode_text(name, input_files.csv_bytes(path, name))
         lines = filter(None, map(str.strip, text.splitlines()))
         comments = list(itertools.takewhile(lambda line: line.startswith("#"), lines))
-    settings, table = _header_settings(name, comments), reading.read_whole_table(path, signal_path)
+    settings = _header_settings(name, comments)
+    table = reading.read_whole_table(path, signal_path)
     if not table.header:
         raise BadData(f"{name}: the file is empty; expected a header that includes time_s, followed by data rows")
     columns = _profile_columns(name, table.header)
@@ -300,9 +303,9 @@ def _profile_columns(name: str, header: Names) -> dict[str, Column]:
         if column not in fields:
             raise BadData(f"{name}: unknown column {column}; {allowed_words(column, fields, 3, usual)}")
         field, meaning = fields[column]
-        first = columns.setdefault(field, meaning).shown
-        if header.count(column) > 1 or first != column:
-            column_words = f"column {column} twice" if column == first else f"columns {first} and {column}"
+        first_name = columns.setdefault(field, meaning).shown
+        if header.count(column) > 1 or first_name != column:
+            column_words = f"column {column} twice" if column == first_name else f"columns {first_name} and {column}"
             raise BadData(f"{name}: got {column_words}; expected one of them")
     if "time" not in columns:
         raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(usual)}")
@@ -359,27 +362,27 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
     second demand is an error.
     """
     modes: list[str] = []
-    shares = [f for f in DEMANDS if DEMANDS[f] == MODES[VOLTAGE] and f in cells.columns]
+    voltage_fields = [f for f in DEMANDS if DEMANDS[f] == MODES[VOLTAGE] and f in cells.columns]
     with_yaw_rate = YAW_RATE in cells.columns
-    usual = {field: float(field == "duty") for field in (*shares, "demand", *[YAW_RATE] * with_yaw_rate)}
+    defaults = {field: float(field == "duty") for field in (*voltage_fields, "demand", *[YAW_RATE] * with_yaw_rate)}
     rows = len(cells.texts["time"])
-    values_by_field = {field: np.full(rows, value) for field, value in usual.items()}
+    values_by_field = {field: np.full(rows, value) for field, value in defaults.items()}
     for row in range(rows):
-        before = modes[-1] if modes else ""
+        mode_before = modes[-1] if modes else ""
         filled = [field for field in DEMANDS if cells.text(field, row)]
-        ends = [field for field in filled if cells.linear and before == DEMANDS[field]]
-        mode = _mode_of_row(cells, row, before, [f for f in filled if f not in ends] or filled)
+        ramp_ends = [field for field in filled if cells.linear and mode_before == DEMANDS[field]]
+        mode = _mode_of_row(cells, row, mode_before, [f for f in filled if f not in ramp_ends] or filled)
         demands = [field for field in filled if DEMANDS[field] == mode]
-        others = [field for field in filled if field not in (*demands, *ends)]
-        _check_demands(cells, row, row < rows - 1 or cells.linear, before, mode, demands, others)
+        others = [field for field in filled if field not in (*demands, *ramp_ends)]
+        _check_demands(cells, row, row < rows - 1 or cells.linear, mode_before, mode, demands, others)
         modes.append(mode)
         for field, values in values_by_field.items() if row and cells.linear else ():  # usual end of a ramp
-            is_demanded = mode == MODES[VOLTAGE] if field in shares else mode in CONTROLLED
-            values[row] = usual[field] if is_demanded else values[row - 1]
-        for field in (*ends, *demands):
+            is_demanded = mode == MODES[VOLTAGE] if field in voltage_fields else mode in CONTROLLED
+            values[row] = defaults[field] if is_demanded else values[row - 1]
+        for field in (*ramp_ends, *demands):
             values_by_field["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
         speed, has_yaw_rate = MODES[SPEED], bool(cells.text(YAW_RATE, row))
-        if has_yaw_rate and mode != speed and not (cells.linear and before == speed):
+        if has_yaw_rate and mode != speed and not (cells.linear and mode_before == speed):
             cells.refuse(YAW_RATE, row, f"an empty cell: a yaw rate needs a demanded speed, not mode {mode}")
         if with_yaw_rate and not has_yaw_rate and mode == speed and (cells.linear or row < rows - 1):
             cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
@@ -388,25 +391,31 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
     return tuple(modes), values_by_field
 
 
-def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -> str:
+def _mode_of_row(cells: _CellReader, row: int, mode_before: str, filled: list[str]) -> str:
     """Mode of a row, as stated or as implied by its demand. If no row has a demand, the motors are off."""
     mode = cells.text(MODE, row)
     if mode and mode not in MODES:
         cells.refuse(MODE, row, f"one of these; {allowed_words(mode, MODES)}")
-    columns = [cells.columns[field].shown for field in DEMANDS if field in cells.columns]
-    mode = mode or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
+    demand_columns = [cells.columns[field].shown for field in DEMANDS if field in cells.columns]
+    mode = mode or (DEMANDS[filled[0]] if filled else "" if demand_columns else MODES[VOLTAGE])
     if not mode and row == len(cells.texts["time"]) - 1:
-        mode = before
+        mode = mode_before
     if not mode:
         raise BadData(
-            f"{cells.source} row {row + 1}: got no demand; expected a value in one of {', '.join(columns)}, or brake "
-            "or coast in the column mode"
+            f"{cells.source} row {row + 1}: got no demand; expected a value in one of {', '.join(demand_columns)}, "
+            "or brake or coast in the column mode"
         )
     return mode
 
 
 def _check_demands(
-    cells: _CellReader, row: int, is_required: bool, before: str, mode: str, demands: list[str], others: list[str]
+    cells: _CellReader,
+    row: int,
+    is_required: bool,
+    mode_before: str,
+    mode: str,
+    demands: list[str],
+    others: list[str],
 ) -> None:
     """Rejects a row with two demands or none, and a ramp between different kinds of demand.
 
@@ -432,8 +441,8 @@ def _check_demands(
         )
     if not demands and is_required:
         cells.refuse(mode, row, f"the demand of mode {mode}")
-    if cells.linear and before in CONTROLLED and before != mode:
+    if cells.linear and mode_before in CONTROLLED and mode_before != mode:
         raise BadData(
-            f"{place}: goes from a demanded {before} to a demanded {mode} although between_rows is linear; expected "
-            "one kind of demand, or a braking or coasting row between"
+            f"{place}: goes from a demanded {mode_before} to a demanded {mode} although between_rows is linear; "
+            "expected one kind of demand, or a braking or coasting row between"
         )

@@ -64,7 +64,7 @@ RATES = (
     ("mm", "m_s", 1e3), ("m", "mm_s", 1e-3),
 )  # fmt: skip
 #: Units that only positions have, and that only rates have.
-_PLACES, _SPEEDS = {"m", "turns"}, {"m_s", "turns_s"}
+_POSITION_UNITS, _RATE_UNITS = {"m", "turns"}, {"m_s", "turns_s"}
 #: Largest relative error of such a ratio, and of a position that is compared with the integral of its rate.
 SAME_RATE, INTEGRAL = 0.03, 0.05
 #: Quantities that the only signal in one of their units is taken to be, if its name has no known meaning.
@@ -95,17 +95,17 @@ class ColumnCandidate:
 
 
 def propose_columns(
-    signals: Sequence[Signal], spelled: set[str], seconds: Callable[[Signal], np.ndarray | None]
+    signals: Sequence[Signal], known_names: set[str], signal_times: Callable[[Signal], np.ndarray | None]
 ) -> Iterator[tuple[str, str]]:
     """Proposes columns for signals: the path of each signal, and its line in a table `[columns]`.
 
     Args:
         signals: signals, in order of preference.
-        spelled: names that are already columns.
-        seconds: function that returns the times of a signal [s].
+        known_names: names that are already columns.
+        signal_times: function that returns the times of a signal [s].
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
-    spelled_stems = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
+    known_stems = {signal.name.rpartition("_")[0] for signal in signals if signal.name in known_names}
     known_units = {unit for units in columns.values() for unit in units.values()}
     known_units -= {"", "s", "ms", "us", "ns", "min", "h"}
     stated_units = {signal.path: _stated_unit(signal, known_units) for signal in signals}
@@ -113,14 +113,14 @@ def propose_columns(
     candidates = (
         _candidate_of_signal(signal, stated_units[signal.path], count[stated_units[signal.path]] == 1, columns)
         for signal in signals
-        if signal.name not in spelled and stated_units[signal.path] in {None, *known_units}
+        if signal.name not in known_names and stated_units[signal.path] in {None, *known_units}
     )
     pool = [candidate for candidate in candidates if candidate is not None]
     groups: dict[str, list[ColumnCandidate]] = {}
-    for candidate in _currents_by_duty(_candidates_by_rate(pool, stated_units, columns, seconds)):
+    for candidate in _currents_by_duty(_candidates_by_rate(pool, stated_units, columns, signal_times)):
         groups.setdefault(candidate.quantity, []).append(candidate)
     for quantity, group in groups.items():
-        if quantity in spelled_stems:
+        if quantity in known_stems:
             continue
         best, *others = sorted(group, key=lambda c: (c.signal.clock is None, bool(c.question)))
         question = best.question
@@ -140,27 +140,27 @@ def _joint_name(signal: Signal, signals: Sequence[Signal]) -> str:
 
 
 def _candidate_of_signal(
-    signal: Signal, unit: str | None, alone: bool, columns: Mapping[str, Mapping[str, str]]
+    signal: Signal, unit: str | None, is_only: bool, columns: Mapping[str, Mapping[str, str]]
 ) -> ColumnCandidate | None:
     """Quantity that a signal may show. None if its unit, behaviour or name excludes all quantities.
 
     Args:
         unit: unit of the signal, spelled as in columns. None: it states none.
-        alone: True if no other signal has that unit.
+        is_only: True if no other signal has that unit.
         columns: column names of each quantity, and their units.
     """
     name = _path_words(signal.path)
     if signal.refused or OTHER.search(name):
         return None
     matches = [quantity for quantity, pattern in MEANINGS if pattern.search(name)]
-    fitting = [q for q in matches if unit is None or unit in columns[q].values()]
-    if not matches and unit is not None and alone and not SENSOR.search(name):
-        fitting = [q for q in BY_UNIT if unit in columns[q].values()]
+    possible = [q for q in matches if unit is None or unit in columns[q].values()]
+    if not matches and unit is not None and is_only and not SENSOR.search(name):
+        possible = [q for q in BY_UNIT if unit in columns[q].values()]
     if COMMAND.search(name):
-        fitting = [q for q in fitting if q in IMPOSED]
-    if not fitting or (signal.words and fitting[0] != "run_id"):
+        possible = [q for q in possible if q in IMPOSED]
+    if not possible or (signal.words and possible[0] != "run_id"):
         return None
-    quantity = fitting[0]
+    quantity = possible[0]
     if quantity == "run_id":
         return ColumnCandidate(signal, quantity, quantity)
     values = np.asarray(signal.load(), float)
@@ -226,17 +226,19 @@ def seconds_per_count(signals: Sequence[Signal], count: np.ndarray) -> float:
     Args:
         count: counts of the clock, shape (rows,).
     """
-    known_units = {unit for of_place, of_rate, _ in RATES for unit in (of_place, of_rate)}
+    known_units = {unit for position_unit, rate_unit, _ in RATES for unit in (position_unit, rate_unit)}
     signals_with_units = [
         (signal, _stated_unit(signal, known_units))
         for signal in signals
         if not (signal.refused or signal.words) and signal.length == len(count)
     ]
-    pairs = {(of_place, of_rate): seconds for of_place, of_rate, seconds in RATES}
-    for (place, of_place), (rate, of_rate) in itertools.permutations(signals_with_units, 2):
-        seconds = pairs.get((of_place or "", of_rate or ""))
+    pairs = {(position_unit, rate_unit): seconds for position_unit, rate_unit, seconds in RATES}
+    for (position, position_unit), (rate_signal, rate_unit) in itertools.permutations(signals_with_units, 2):
+        seconds = pairs.get((position_unit or "", rate_unit or ""))
         if seconds is not None:
-            factor = _integral_factor(count, np.asarray(place.load(), float), np.asarray(rate.load(), float))
+            factor = _integral_factor(
+                count, np.asarray(position.load(), float), np.asarray(rate_signal.load(), float)
+            )
             if math.isfinite(factor) and factor > 0:
                 return factor / seconds
     return math.nan
@@ -246,7 +248,7 @@ def _candidates_by_rate(
     pool: Sequence[ColumnCandidate],
     stated: Mapping[str, str | None],
     columns: Mapping[str, Mapping[str, str]],
-    seconds: Callable[[Signal], np.ndarray | None],
+    signal_times: Callable[[Signal], np.ndarray | None],
 ) -> Iterator[ColumnCandidate]:
     """Candidates for position and speed with consistent units.
 
@@ -255,33 +257,33 @@ def _candidates_by_rate(
         columns: as in `_candidate_of_signal`.
     """
     agreed: dict[str, ColumnCandidate] = {}
-    places = [c.signal for c in pool if _PLACES & {*columns[c.quantity].values()}]
+    positions = [c.signal for c in pool if _POSITION_UNITS & {*columns[c.quantity].values()}]
     rates = [
         c.signal
         for c in pool
-        if _SPEEDS & {*columns[c.quantity].values()} and "motor" not in c.signal.path.casefold()
+        if _RATE_UNITS & {*columns[c.quantity].values()} and "motor" not in c.signal.path.casefold()
     ]
-    for place, rate in itertools.product(places, rates):
-        time = seconds(rate) if place.length == rate.length and place.path not in agreed else None
+    for position, rate in itertools.product(positions, rates):
+        time = signal_times(rate) if position.length == rate.length and position.path not in agreed else None
         if time is None or len(time) != rate.length:
             continue
-        stated_units = stated[place.path], stated[rate.path]
-        units = _units_of_position_and_rate(time, place, rate, stated_units)
+        stated_units = stated[position.path], stated[rate.path]
+        units = _units_of_position_and_rate(time, position, rate, stated_units)
         if not units:
             continue
-        words, *others = (f"{p} and {v.replace('_', '/')}" for p, v in units[:4])
-        either = f"; or {' or '.join(others)}?" if others else ""
+        units_text, *other_texts = (f"{p} and {v.replace('_', '/')}" for p, v in units[:4])
+        either = f"; or {' or '.join(other_texts)}?" if other_texts else ""
         quantities_of_both = ("position", "speed") if units[0][0] in ("m", "mm") else ("output_angle", "output_speed")
         for signal, other, quantity, unit in zip(
-            (place, rate), (rate, place), quantities_of_both, units[0], strict=True
+            (position, rate), (rate, position), quantities_of_both, units[0], strict=True
         ):
-            question = f"by {other.path}, in {words}{either}" if None in stated_units else ""
+            question = f"by {other.path}, in {units_text}{either}" if None in stated_units else ""
             agreed[signal.path] = ColumnCandidate(signal, quantity, _column_in(columns[quantity], unit), question)
     yield from (agreed.get(c.signal.path, c) for c in pool)
 
 
 def _units_of_position_and_rate(
-    time: np.ndarray, place: Signal, rate: Signal, stated: Sequence[str | None]
+    time: np.ndarray, position: Signal, rate: Signal, stated: Sequence[str | None]
 ) -> list[tuple[str, str]]:
     """Units in which a position is the integral of its rate, empty if it is not.
 
@@ -290,27 +292,27 @@ def _units_of_position_and_rate(
         stated: unit of each, None if it states none.
     """
     rate_values = np.asarray(rate.load(), float)
-    factor = _integral_factor(time, np.asarray(place.load(), float), rate_values)
-    turns = re.search(r"angle|theta|omega|rpm", _path_words(f"{place.path} {rate.path}"))
-    no_length = not any(stated) and (bool(turns) or float(np.nanmax(np.abs(rate_values))) > LARGEST_M_S)
+    factor = _integral_factor(time, np.asarray(position.load(), float), rate_values)
+    is_rotation = re.search(r"angle|theta|omega|rpm", _path_words(f"{position.path} {rate.path}"))
+    is_no_length = not any(stated) and (bool(is_rotation) or float(np.nanmax(np.abs(rate_values))) > LARGEST_M_S)
     return [
-        (of_place, of_rate)
-        for of_place, of_rate, seconds in RATES
+        (position_unit, rate_unit)
+        for position_unit, rate_unit, seconds in RATES
         if abs(factor / seconds - 1) < SAME_RATE
-        and stated[0] in (None, of_place)
-        and stated[1] in (None, of_rate)
-        and not (no_length and of_place in ("m", "mm"))
+        and stated[0] in (None, position_unit)
+        and stated[1] in (None, rate_unit)
+        and not (is_no_length and position_unit in ("m", "mm"))
     ]
 
 
-def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> float:
+def _integral_factor(time: np.ndarray, position: np.ndarray, rate: np.ndarray) -> float:
     """Ratio of a position to the integral of a rate, NaN if the position is not that integral."""
     step = np.diff(time)
-    is_usable = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
+    is_usable = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(position)) & np.isfinite(rate[1:] + rate[:-1])
     if is_usable.sum() < 3:
         return math.nan
     is_usable &= step <= 5 * np.median(step[is_usable])
-    distance = np.cumsum(np.where(is_usable, np.diff(place), 0.0))
+    distance = np.cumsum(np.where(is_usable, np.diff(position), 0.0))
     integral = np.cumsum(np.where(is_usable, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
     if not np.any(integral):
         return math.nan
@@ -326,15 +328,15 @@ def _currents_by_duty(candidates: Iterable[ColumnCandidate]) -> Iterator[ColumnC
     pool = [*candidates]
     duties = [c for c in pool if c.quantity == "duty"][:1]
     currents = [c for c in pool if c.quantity in ("total_current", "motor_current")]
-    meant = {id(c): c.quantity for c in currents}
+    quantity_by_id = {id(c): c.quantity for c in currents}
     for (supply, motor), duty in itertools.product(itertools.permutations(currents, 2), duties):
         if supply.signal.length == motor.signal.length == duty.signal.length:
-            of_supply, of_motor, share = (
+            supply_current, motor_current, share = (
                 np.abs(np.asarray(c.signal.load(), float) * c.factor) for c in (supply, motor, duty)
             )
-            if np.nanmedian(np.abs(of_supply - share * of_motor)) < POWER * np.nanmedian(of_supply):
-                meant |= {id(supply): "total_current", id(motor): "motor_current"}
+            if np.nanmedian(np.abs(supply_current - share * motor_current)) < POWER * np.nanmedian(supply_current):
+                quantity_by_id |= {id(supply): "total_current", id(motor): "motor_current"}
     for candidate in pool:
-        quantity = meant.get(id(candidate), candidate.quantity)
+        quantity = quantity_by_id.get(id(candidate), candidate.quantity)
         column = candidate.column.replace(candidate.quantity, quantity)
         yield replace(candidate, quantity=quantity, column=column)

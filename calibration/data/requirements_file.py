@@ -213,10 +213,12 @@ def _updated_envelope(base: Envelope, stated: Json, where: str) -> Envelope:
             envelope[key] = stated_word(value, SURFACES, key_path, f"got {value!r}")
         else:
             envelope[key] = stated_as(value, str, key_path, "the name of a configuration")
-    other = next((key for key in ("battery", "state_of_charge") if envelope.get(key)), None)
+    contradicting = next((key for key in ("battery", "state_of_charge") if envelope.get(key)), None)
     if "supply_voltage_V" in envelope:
-        if other is not None:
-            raise BadConfiguration(f"{where}: {other} and supply_voltage_V contradict each other; give one of them")
+        if contradicting is not None:
+            raise BadConfiguration(
+                f"{where}: {contradicting} and supply_voltage_V contradict each other; give one of them"
+            )
         envelope["battery"] = False
     elif "state_of_charge" in envelope and not envelope.setdefault("battery", True):
         raise BadConfiguration(f"{where}: state_of_charge needs the battery; got battery = false")
@@ -228,26 +230,27 @@ def _updated_envelope(base: Envelope, stated: Json, where: str) -> Envelope:
 
 def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str) -> list[Requirement]:
     """Requirements of one entry: at least, at most, or both."""
-    quantity, is_endurance = QUANTITIES[name], name == "endurance_min"
+    quantity = QUANTITIES[name]
+    is_endurance = name == "endurance_min"
     table = value if isinstance(value, dict) else {"least" if quantity.least else "most": value}
-    own_keys = {"endurance_min": ("duty", "share"), STAIRS: (TREAD,)}.get(name, ())
+    further_keys = {"endurance_min": ("duty", "share"), STAIRS: (TREAD,)}.get(name, ())
     for key in table:
         if key in ("duty", "share") and not is_endurance:
             raise BadConfiguration(f"{where}: duty and share can be used only with endurance_min")
-        stated_word(key, ("least", "most", "source", *KEYS, *own_keys), f"{where}, {key}", NO_KEY)
+        stated_word(key, ("least", "most", "source", *KEYS, *further_keys), f"{where}, {key}", NO_KEY)
         if key in AXES and key not in quantity.axes:
             raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")
     limits = {sense: _parse_limit(table[sense], where, quantity) for sense in ("least", "most") if sense in table}
     if not limits:
         raise BadConfiguration(f"{where}: expected least, most or both [{quantity.unit}]")
     source = stated_as(table.get("source", ""), str, f"{where}, source", "text")
-    depth = 0.0
+    tread = 0.0
     if name == STAIRS:
         if TREAD not in table:
             raise BadConfiguration(
                 f"{where}: stairs without a tread; expected a table such as {{ least = 170, {TREAD} = 290 }}"
             )
-        depth = stated_number(table[TREAD], f"{where}, {TREAD}", *TREADS, "mm")
+        tread = stated_number(table[TREAD], f"{where}, {TREAD}", *TREADS, "mm")
     envelope = _updated_envelope(envelope, {key: table[key] for key in KEYS if key in table}, where)
     if is_endurance and not envelope.battery:
         raise BadConfiguration(f"{where}: endurance needs the battery, but the envelope sets supply_voltage_V")
@@ -259,7 +262,7 @@ def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str
         envelope = replace(envelope, state_of_charge=(envelope.charge_end, envelope.charge_end))
     share = _parse_share(table.get("duty"), table.get("share"), where)
     return [
-        Requirement(name, limit, sense == "least", envelope, share, source, depth) for sense, limit in limits.items()
+        Requirement(name, limit, sense == "least", envelope, share, source, tread) for sense, limit in limits.items()
     ]
 
 
@@ -289,22 +292,23 @@ def _parse_share(duty: Any, share: Any, where: str) -> float:
 _SAME = {"speed_end_of_charge_m_s": "speed_m_s", "gearbox_speed_rpm": "motor_speed_rpm"}
 
 
-def _check_consistent(each: list[Requirement], envelope: Envelope, where: str) -> None:
-    limits = [(r, r.limit) for r in each if r.limit is not None]
+def _check_consistent(requirements: list[Requirement], envelope: Envelope, where: str) -> None:
+    limits = [(r, r.limit) for r in requirements if r.limit is not None]
     for (a, least), (b, most) in product(limits, limits):
-        of_a, of_b = ((_SAME.get(r.name, r.name), r.share, r.tread_mm) for r in (a, b))
-        if a.least and not b.least and least > most and of_a == of_b and a.envelope.meets(b.envelope):
+        subject_a, subject_b = ((_SAME.get(r.name, r.name), r.share, r.tread_mm) for r in (a, b))
+        if a.least and not b.least and least > most and subject_a == subject_b and a.envelope.meets(b.envelope):
             unit = a.quantity.unit
             raise BadConfiguration(
                 f"{where}: {a.name} at least {least:g} {unit} and {b.name} at most {most:g} {unit} contradict "
                 "each other"
             )
     for r, limit in limits:
-        key, ends = r.name, {"payload_kg": envelope.payload_kg, "slope_deg": envelope.slope_deg}.get(r.name)
+        key = r.name
+        range_ = {"payload_kg": envelope.payload_kg, "slope_deg": envelope.slope_deg}.get(key)
         if r.name == "winding_C":
-            key, ends = "ambient_C", r.envelope.ambient_C
-        if ends is not None and limit < ends[1] and (r.least or key == "ambient_C"):
+            key, range_ = "ambient_C", r.envelope.ambient_C
+        if range_ is not None and limit < range_[1] and (r.least or key == "ambient_C"):
             raise BadConfiguration(
                 f"{where}: {r.name} of at {r.sense} {limit:g} contradicts the envelope, whose {key} goes up to "
-                f"{ends[1]:g}"
+                f"{range_[1]:g}"
             )

@@ -55,19 +55,19 @@ def derived_facts(robot: Robot) -> list[DerivedFact]:
 
 
 def _fact(
-    what: str, value: float, unit: str, usual: tuple[float, float], why: str, scale: float = 1.0
+    what: str, value: float, unit: str, usual: tuple[float, float], advice: str, scale: float = 1.0
 ) -> DerivedFact:
-    """Fact about a value, shown `scale` times as large. Outside its usual range it is odd, for the reason `why`."""
+    """Fact about a value, shown `scale` times as large. Outside its usual range it is odd and has the `advice`."""
     low, high = usual
-    odd = "" if low <= value <= high else f"{why} (usual: {three_digits(low)} to {three_digits(high)})"
+    odd = "" if low <= value <= high else f"{advice} (usual: {three_digits(low)} to {three_digits(high)})"
     return DerivedFact(what, f"{three_digits(scale * value)} {unit}".rstrip(), odd)
 
 
 def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
     motor, voltage = robot.motor, robot.motor.voltage_limit
     constant, resistance, inertia = (float(x) for x in (motor.torque_constant, motor.resistance, motor.inertia))
-    with_constant, with_resistance = robot.knows(["motor.torque_constant"]), robot.knows(["motor.resistance"])
-    if with_constant:
+    knows_constant, knows_resistance = robot.knows(["motor.torque_constant"]), robot.knows(["motor.resistance"])
+    if knows_constant:
         yield _fact(
             "no-load speed per volt", 1 / constant / RPM, "rpm/V", (5, 20_000),
             "is torque_constant in N·m/A? 1 mN·m/A is 0.001",
@@ -83,20 +83,20 @@ def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
                 f"{three_digits(fastest / RPM)} rpm",
                 "more than twice motor.speed_limit. Check torque_constant" * (fastest >= 2 * motor.speed_limit),
             )
-    if with_resistance and voltage is not None:
+    if knows_resistance and voltage is not None:
         yield _fact(
             f"stall current at {three_digits(voltage)} V", float(motor.current_stall(voltage)), "A", (0.02, 1000),
             "check motor.resistance",
         )  # fmt: skip
-    if with_constant and with_resistance:
-        size = constant**2 / resistance
+    if knows_constant and knows_resistance:
+        torque_per_speed = constant**2 / resistance
         yield _fact(
-            "torque over speed k²/R", size, "mN·m·s", (1e-7, 1.0),
+            "torque over speed k²/R", torque_per_speed, "mN·m·s", (1e-7, 1.0),
             "torque_constant and resistance fit no one motor. Check their units", scale=1e3,
         )  # fmt: skip
         if inertia > 0:
             yield _fact(
-                "mechanical time constant of the motor alone J R/k²", inertia / size, "ms", (5e-4, 0.5),
+                "mechanical time constant of the motor alone J R/k²", inertia / torque_per_speed, "ms", (5e-4, 0.5),
                 "check motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance", scale=1e3,
             )  # fmt: skip
 
@@ -129,7 +129,7 @@ def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterat
 
 def _shaft_facts(robot: Robot, name: str, load: Shaft) -> Iterator[DerivedFact]:
     friction, constant, gravity = (float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity))
-    inertia, of_motor, travel = float(load.inertia), float(robot.motor.inertia), 2 * math.pi * float(load.radius)
+    inertia, motor_inertia, travel = float(load.inertia), float(robot.motor.inertia), 2 * math.pi * float(load.radius)
     places = f"{name}.loss_coulomb [N·m, at the output]"
     yield from _current_fact(robot, f"{name}: current to turn it slowly", friction + max(constant, 0.0), places)
     if gravity > 0:
@@ -140,10 +140,10 @@ def _shaft_facts(robot: Robot, name: str, load: Shaft) -> Iterator[DerivedFact]:
             f"{name}: length of a pendulum with the same period", inertia * GRAVITY / gravity, "mm", (0.01, 3.0),
             f"{name}.inertia and {name}.torque_gravity are unlikely to belong to one arm (m l² and m g l)", scale=1e3,
         )  # fmt: skip
-    if inertia > 0 and of_motor > 0:
+    if inertia > 0 and motor_inertia > 0:
         yield _fact(
             f"{name}: load inertia over motor inertia, both at the output",
-            inertia / (of_motor * float(robot.gearbox.ratio) ** 2), "", (1e-4, 1e4),
+            inertia / (motor_inertia * float(robot.gearbox.ratio) ** 2), "", (1e-4, 1e4),
             f"check {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7",
         )  # fmt: skip
     if float(load.radius) != 1.0:
@@ -160,11 +160,11 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
     torque = weight * resistance * radius / sides + loss
     yield from _current_fact(robot, f"{name}: current to roll slowly on the flat", torque, places)
-    static = load["ground.friction.static"]
-    grip = math.degrees(math.atan(static))
-    fact = _fact(f"{name}: steepest slope without sliding", grip, "", (5, 60), "check friction.static")
-    odd = "it cannot move on the flat: friction.static is below the resistance" * (static <= resistance)
-    yield replace(fact, value=f"{grip:.0f}°", odd=odd or fact.odd)
+    friction = load["ground.friction.static"]
+    slope = math.degrees(math.atan(friction))
+    fact = _fact(f"{name}: steepest slope without sliding", slope, "", (5, 60), "check friction.static")
+    odd = "it cannot move on the flat: friction.static is below the resistance" * (friction <= resistance)
+    yield replace(fact, value=f"{slope:.0f}°", odd=odd or fact.odd)
     if limit is None or not robot.knows(["motor.resistance"]):
         return
     pull = (slow_output_torque(motor, robot.gearbox, float(motor.current_stall(limit))) - loss) * sides / radius
@@ -221,28 +221,28 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     The current is far from the current that turns the loads slowly.
     """
     column, present = runs.layout.imposed_column, set(runs["configuration"])
-    loads = [x for name, x in robot.configurations.items() if name in present and isinstance(x, Shaft)]
+    loads = [load for name, load in robot.configurations.items() if name in present and isinstance(load, Shaft)]
     if column != CURRENT or not loads:
         return ""
-    needed = max(
+    slow_current = max(
         slow_motor_current(
             robot.motor,
             robot.gearbox,
-            abs(float(x.loss_coulomb)) + abs(float(x.torque_constant)) + abs(float(x.torque_gravity)),
+            abs(float(load.loss_coulomb)) + abs(float(load.torque_constant)) + abs(float(load.torque_gravity)),
         )
-        for x in loads
+        for load in loads
     )
-    turning = runs["held"] < 0.5 if runs.has("held") else np.full(len(runs), True)
-    largest = float(np.nanmax(np.abs(runs[column][turning]), initial=0.0))
-    if needed == 0 or not turning.any() or LEAST < largest / needed < MOST:
+    is_free = runs["held"] < 0.5 if runs.has("held") else np.full(len(runs), True)
+    largest = float(np.nanmax(np.abs(runs[column][is_free]), initial=0.0))
+    if slow_current == 0 or not is_free.any() or LEAST < largest / slow_current < MOST:
         return ""
     heading = runs.heading(column)
-    motionless = largest > needed and not any(c.zero_at_rest and runs.has(c.column) for c in runs.channels)
-    clamp_hint = "Was the shaft held? Then add a column held with 1 in these rows. " * motionless
+    is_motionless = largest > slow_current and not any(c.zero_at_rest and runs.has(c.column) for c in runs.channels)
+    clamp_hint = "Was the shaft held? Then add a column held with 1 in these rows. " * is_motionless
     return (
         f"{runs.source}, {heading}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
-        f"slowly at {three_digits(needed)} A. {clamp_hint}Is it in another unit (mA, mN·m)? Then state [columns] "
-        f'{column} = {{column = "{heading}", factor = ...}}'
+        f"slowly at {three_digits(slow_current)} A. {clamp_hint}Is it in another unit (mA, mN·m)? Then state "
+        f'[columns] {column} = {{column = "{heading}", factor = ...}}'
     )
 
 
@@ -287,12 +287,12 @@ def saturation_sentence(runs: Runs) -> str:
     """
     # With a duty, the supply current is only a share of the motor current.
     currents = [c for c in (CURRENT, *["total_current_A"] * (not runs.has("duty"))) if runs.has(c)]
-    read = (*currents[:1], SPEED)
+    columns = (*currents[:1], SPEED)
     if runs.layout.imposed != "voltage" or runs.turns or not runs.sampled or not currents or not runs.has(SPEED):
         return ""
-    if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in read):
+    if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in columns):
         return ""
-    drive, readings = applied_drive(runs), np.stack([runs[column] for column in read], 1)
+    drive, readings = applied_drive(runs), np.stack([runs[column] for column in columns], 1)
     is_read, size = np.isfinite(readings).all(1), np.abs(drive)
     is_inner = is_read & (drive != 0) & (size <= INNER * float(size.max()))
     if is_inner.sum() < ROWS_INNER:
@@ -348,27 +348,27 @@ def swapped_sentence(runs: Runs) -> str:
     """Sentence on a motion whose sign changes within a log although the drive does not, empty for others."""
     if not (runs.sampled and runs.has(runs.layout.imposed_column)):
         return ""
-    drive, of_runs = np.nan_to_num(applied_drive(runs)), list(runs.rows_by_run().values())
+    drive, rows_of_runs = np.nan_to_num(applied_drive(runs)), list(runs.rows_by_run().values())
     if not drive.min() < 0 < drive.max():
         return ""  # a signal that never changes sign may lack it, which other checks report
     for channel, readings in zip(runs.channels, runs.measured().T, strict=True):
         if not channel.zero_at_rest:
             continue
         power = np.zeros(len(drive))
-        for rows in of_runs:
+        for rows in rows_of_runs:
             motion = readings[rows] if channel.settled or len(rows) < 2 else np.gradient(readings[rows])
             power[rows] = np.nan_to_num(drive[rows] * motion)
             power[rows] /= max(float(np.abs(power[rows]).mean()), 1e-300)
-        for rows in (*of_runs, np.concatenate(of_runs)):
+        for rows in (*rows_of_runs, np.concatenate(rows_of_runs)):
             total = np.cumsum(power[rows]) / max(float(np.abs(power[rows]).sum()), 1e-300)
-            turn = int(np.argmax(np.abs(total)))
-            before, after = total[turn], total[-1] - total[turn]
-            parts = np.split(drive[rows], [turn + 1])
+            split = int(np.argmax(np.abs(total)))
+            before, after = total[split], total[-1] - total[split]
+            parts = np.split(drive[rows], [split + 1])
             # Of an angle, both parts need both directions: a load without friction returns its energy as it brakes.
-            both = channel.settled or all(x.min(initial=0.0) < 0 < x.max(initial=0.0) for x in parts)
-            if both and before * after < 0 and min(abs(before), abs(after)) > SWAPPED:
+            has_directions = channel.settled or all(x.min(initial=0.0) < 0 < x.max(initial=0.0) for x in parts)
+            if has_directions and before * after < 0 and min(abs(before), abs(after)) > SWAPPED:
                 return (
-                    f"{runs.place(rows[turn] + 1)}, {runs.heading(channel.column)}: from here on its sign is "
+                    f"{runs.place(rows[split] + 1)}, {runs.heading(channel.column)}: from here on its sign is "
                     f"opposite to {drive_heading(runs)}. Correct one part"
                 )
     return ""
@@ -376,9 +376,9 @@ def swapped_sentence(runs: Runs) -> str:
 
 def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Doubts about a log, one sentence each: times, levels, limits, and units that do not fit the robot."""
-    of_runs = (jitter_sentence, saturation_sentence, swapped_sentence)
-    of_robot = (doubtful_time, doubtful_current, doubtful_torque)
-    doubts = (*(doubt(runs) for doubt in of_runs), *(doubt(runs, robot) for doubt in of_robot))
+    checks_of_runs = (jitter_sentence, saturation_sentence, swapped_sentence)
+    checks_of_robot = (doubtful_time, doubtful_current, doubtful_torque)
+    doubts = (*(check(runs) for check in checks_of_runs), *(check(runs, robot) for check in checks_of_robot))
     return tuple(filter(None, doubts))
 
 
@@ -387,7 +387,7 @@ class NumberOrigin:
     """Origin of a parameter value.
 
     Attributes:
-        name: name and value of the parameter [unit].
+        name, value, unit: the parameter.
         sd: standard deviation, None if the file states none.
         why: origin, in words.
     """

@@ -44,7 +44,7 @@ LINEAR = {
     "inertia": "inertia of parts that turn with the output, without the mass [kg·m^2]",
 }
 _TRAVEL = ("lead_mm", "drum_radius_mm")
-_LEAST = {"mass_kg", *_TRAVEL}  # must be greater than 0
+_POSITIVE = {"mass_kg", *_TRAVEL}  # must be greater than 0
 
 #: Default values of a robot without a base, each with its reason. It has no limits and no other losses
 #: (`robots.blank`).
@@ -108,13 +108,13 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
         sides: number of drives that move it together.
 
     Raises:
-        BadConfiguration: a key is unknown, a value is no number, the mass is missing, lead and drum are both given or
-            both missing, or one of these is not positive.
+        BadConfiguration: a key is unknown, a value is no number, or the mass is missing. Also if lead and drum are
+            both given or both missing, or mass, lead or drum is not positive.
     """
     for key, value in table.items():
         stated_word(key, LINEAR, f"{where}.{key}", "no such key of a linear unit")
-        if not is_number(value) or not math.isfinite(value) or (key in _LEAST and value <= 0):
-            expected = "a number above 0" if key in _LEAST else "a number"
+        if not is_number(value) or not math.isfinite(value) or (key in _POSITIVE and value <= 0):
+            expected = "a number above 0" if key in _POSITIVE else "a number"
             raise BadConfiguration(f"{where}.{key}: got {value!r}; expected {expected} ({LINEAR[key]})")
     values = {key: float(value) for key, value in table.items()}
     travels = [key for key in _TRAVEL if key in values]
@@ -132,22 +132,22 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
         return _shaft_of_linear_unit({**values, key: values[key] + step}, sides)[result] - float(table[result])
 
     for result in table:
-        acting = {key for key in values if change(result, key, 0.01 * values[key] + 1e-6)}
+        influences = {key for key in values if change(result, key, 0.01 * values[key] + 1e-6)}
         sd = math.hypot(*(change(result, key, sd) for key, sd in inputs.items()))
-        if acting and all(inputs.get(key) == 0 for key in acting):
+        if influences and all(inputs.get(key) == 0 for key in influences):
             sds[f"{name}.{result}"] = 0.0
         elif sd > 0:
             sds[f"{name}.{result}"] = float(f"{sd:.12g}")
 
 
-def _shaft_of_linear_unit(at: Mapping[str, float], sides: float) -> dict[str, float]:
-    travel = (at["lead_mm"] / (2 * math.pi) if "lead_mm" in at else at["drum_radius_mm"]) * 1e-3
-    weight = at["mass_kg"] * GRAVITY * math.sin(math.radians(at.get("incline_deg", 0.0)))
+def _shaft_of_linear_unit(values: Mapping[str, float], sides: float) -> dict[str, float]:
+    travel = (values["lead_mm"] / (2 * math.pi) if "lead_mm" in values else values["drum_radius_mm"]) * 1e-3
+    weight = values["mass_kg"] * GRAVITY * math.sin(math.radians(values.get("incline_deg", 0.0)))
     return {
-        "inertia": at.get("inertia", 0.0) + at["mass_kg"] * travel**2 / sides,
-        "loss_coulomb": at.get("force_coulomb_N", 0.0) * travel / sides,
-        "loss_viscous": at.get("force_viscous_N_s_m", 0.0) * travel**2 / sides,
-        "torque_constant": (at.get("force_constant_N", 0.0) + weight) * travel / sides,
+        "inertia": values.get("inertia", 0.0) + values["mass_kg"] * travel**2 / sides,
+        "loss_coulomb": values.get("force_coulomb_N", 0.0) * travel / sides,
+        "loss_viscous": values.get("force_viscous_N_s_m", 0.0) * travel**2 / sides,
+        "torque_constant": (values.get("force_constant_N", 0.0) + weight) * travel / sides,
         "radius": travel,
     }
 
@@ -182,25 +182,28 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
             channel that the rig does not have.
     """
 
-    def word(key: str, words: Sequence[str]) -> str:
+    def pop_word(key: str, words: Sequence[str]) -> str:
         value = content.pop(key, words[0])
         if key == "imposed" and isinstance(value, str):
             value = SHORT.get(value, value)
         return stated_word(value, words, f"{where}, {key}")
 
-    imposed, start, between = word("imposed", IMPOSED), word("start", STARTS), word("between_rows", BETWEEN)
-    usual = [name for name in channels.USUAL if name != imposed and (travels or name != "speed")]
-    all_channels, place = channels.channel_names(channels.EVERY), f"{where}, channels"
+    imposed = pop_word("imposed", IMPOSED)
+    start = pop_word("start", STARTS)
+    between = pop_word("between_rows", BETWEEN)
+    default_channels = [name for name in channels.USUAL if name != imposed and (travels or name != "speed")]
+    place = f"{where}, channels"
+    all_channels = channels.channel_names(channels.EVERY)
     expected = f"a list of channels, at least one of {', '.join(all_channels)}"
-    stated_channels = stated_names(content.pop("channels", usual), place, expected)
+    stated_channels = stated_names(content.pop("channels", default_channels), place, expected)
     for name in stated_channels:
         stated_word(name, all_channels, place)
         if stated_channels.count(name) > 1:
             raise BadConfiguration(f"{place}: {name} is repeated; expected each channel once")
     names = tuple(name for name in all_channels if name in stated_channels)
-    if idle := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
+    if imposed_channels := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
         raise BadConfiguration(
-            f"{place}: {min(idle)} is imposed, so it cannot be a reading; remove it, or set imposed = "
+            f"{place}: {min(imposed_channels)} is imposed, so it cannot be a reading; remove it, or set imposed = "
             f'"{next(word for word in IMPOSED if word != imposed)}"'
         )
     columns = stated_as(content.pop("columns", {}), dict, f"{where}, columns", "a table [columns]")
@@ -213,7 +216,8 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
         channels=names,
         instruments=_parse_instruments(content.pop("instruments", {}), names, f"{where}, instruments"),
         columns=tuple(
-            (c.mine, c.theirs[0], c.factor) for c in presets_file.parse_columns(columns, where, ("column", "factor"))
+            (c.column, c.source_columns[0], c.factor)
+            for c in presets_file.parse_columns(columns, where, ("column", "factor"))
         ),
         start=start,
         between_rows=between,
@@ -245,8 +249,8 @@ def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[I
                 f"{place}.quantum: got {quantum!r}; expected the resolution of its readings, 0 or more "
                 f"{channel.unit}, or {FREE!r} (decided from the table)"
             )
-        step = None if quantum == FREE else float(quantum) * channel.factor
-        instruments.append(Instrument(name, None if signed == FREE else signed, step))
+        quantum_si = None if quantum == FREE else float(quantum) * channel.factor
+        instruments.append(Instrument(name, None if signed == FREE else signed, quantum_si))
     return tuple(instruments)
 
 
@@ -288,9 +292,11 @@ def reject_missing(
     if missing:
         names_with_units = ", ".join(f"{name} [{known[name].spec.unit}]" for name in missing)
         verb = "is" if len(missing) == 1 else "are"
-        strange = [name for name in given if name not in known]
-        near = [(x, name) for name in missing for x in difflib.get_close_matches(name, strange, 1, 0.85)]
-        misspelt = "".join(f"; is {x} meant to be {name}?" for x, name in near)
+        unknown = [name for name in given if name not in known]
+        likely = [
+            (given_name, name) for name in missing for given_name in difflib.get_close_matches(name, unknown, 1, 0.85)
+        ]
+        misspelt = "".join(f"; is {given_name} meant to be {name}?" for given_name, name in likely)
         raise BadConfiguration(
             f'{where}: {names_with_units} {verb} missing; a robot with base = "none" needs every parameter '
             f"(mmrjax rig new writes them){misspelt}"
@@ -324,11 +330,11 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
         f'between_rows = "{rig.between_rows}"  # imposed quantity between rows of time histories: held or linear',
     ]
     tables: dict[str, list[str]] = {}
-    for own_column, logger_column, factor in rig.columns:
-        entry = toml_value(logger_column)
+    for column, source_column, factor in rig.columns:
+        entry = toml_value(source_column)
         if factor != 1:
             entry = f"{{column = {entry}, factor = {factor!r}}}"
-        tables.setdefault("columns", []).append(f"{own_column} = {entry}")
+        tables.setdefault("columns", []).append(f"{column} = {entry}")
     for name, other in rig.surfaces:
         lines = tables.setdefault("surfaces", ["# these differ only in their ground"])
         lines.append(f"{toml_value(name)} = {toml_value(other)}")
@@ -338,6 +344,6 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
             f"signed = {toml_value(FREE if instrument.signed is None else instrument.signed)}"
         ]
         if instrument.quantum != 0:
-            size = FREE if instrument.quantum is None else instrument.quantum / channel.factor
-            lines.append(f"quantum = {toml_value(size)}  # [{channel.unit}] step of its readings")
+            quantum = FREE if instrument.quantum is None else instrument.quantum / channel.factor
+            lines.append(f"quantum = {toml_value(quantum)}  # [{channel.unit}] step of its readings")
     return head, tables

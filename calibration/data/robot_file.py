@@ -162,7 +162,7 @@ def find_robot_file(name_or_path: str, library: Library = effects.BY_NAME) -> Ro
 
 
 def parse_robot_file(path: Path, library: Library = effects.BY_NAME) -> RobotFile:
-    """Read a robot file. Its effects are looked up in `library` and among the curves.
+    """Robot and origin of its numbers, from a file. Its effects are looked up in `library` and among the curves.
 
     The file states, all optional:
         schema: version of the file format.
@@ -184,7 +184,8 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME) -> RobotFil
             number, not finite, or outside its field's bounds. Also for the reasons of `loads_from_tables` and
             `add_effects`.
     """
-    where, text = path.name, input_files.toml_text(path, path.name)
+    where = path.name
+    text = input_files.toml_text(path, where)
     content = input_files.toml_content(text, where)
     if not content:
         raise BadConfiguration(
@@ -199,16 +200,16 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME) -> RobotFil
         None if base == rig_file.NONE else paper_robots.ROBOTS[base](), content, where, stated.example_numbers(text)
     )
     present = stated_as(content.get("effects", {}), dict, f"{where}, effects", "tables such as [effects.churning]")
-    acting: Json = {}
+    configurations_by_effect: Json = {}
     scaled: dict[str, type[effects.Effect]] = {}
     for name, table in present.items():
         if name not in {**effects.BESIDE, **library}:
             raise BadConfiguration(f"{where}, effects.{name}: no such effect; {allowed_words(name, library)}")
         if isinstance(table, dict) and "configurations" in table:
-            acting[name] = table.pop("configurations")
+            configurations_by_effect[name] = table.pop("configurations")
         if isinstance(table, dict) and FACTORS in table:
             scaled[name] = _scaled_effect(library, name, table.pop(FACTORS), f"{where}, effects.{name}.{FACTORS}")
-    robot = add_effects(robot, tuple(present), {**library, **scaled}, acting, where)
+    robot = add_effects(robot, tuple(present), {**library, **scaled}, configurations_by_effect, where)
     parameters = input_files.flat_table(content)
     robot = rig_file.with_priors(change_robot(robot, parameters, where), sds, where)
     remarks = battery_remarks(robot, parameters, where)
@@ -294,15 +295,16 @@ def add_effects(
     Raises:
         BadConfiguration: the configurations of an effect are no list of names, or the robot lacks one.
     """
-    present = []
+    acting_effects = []
     for name in names:
-        effect, place = {**effects.BESIDE, **library}[name](), f"{where}, effects.{name}.configurations"
+        effect = {**effects.BESIDE, **library}[name]()
+        place = f"{where}, effects.{name}.configurations"
         acting = (configurations or {}).get(name, effect.configurations)
         acting = stated_names(acting, place, f"a list of {', '.join(robot.configurations)}", least=0)
         for c in acting:
             stated_word(c, robot.configurations, place)
-        present.append(replace(effect, configurations=acting))
-    return replace(robot, effects=tuple(present))
+        acting_effects.append(replace(effect, configurations=acting))
+    return replace(robot, effects=tuple(acting_effects))
 
 
 def change_robot(robot: Robot, values: Mapping[str, Any], where: str) -> Robot:
@@ -374,8 +376,8 @@ def _refusal_reason(name: str, value: Any, known: Mapping[str, params.Parameter]
 
 def _add_required_states(robot: Robot, where: str) -> Robot:
     """Robot with the states that its values require: two bodies for a compliant load, a lagged duty."""
-    loose = {name: load for name, load in robot.configurations.items() if load.has_two_bodies}
-    for name, load in loose.items():
+    two_bodies = {name: load for name, load in robot.configurations.items() if load.has_two_bodies}
+    for name, load in two_bodies.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
             key, unit = ("backlash", "rad") if load.backlash > 0 else ("stiffness", "N·m/rad")
             raise BadConfiguration(
@@ -395,7 +397,7 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
                 f"{where}, controller.samples_late: got {controller.samples_late:g} with rate = "
                 f"{controller.rate:g}; expected 0, or with a rate 1"
             )
-    return replace(robot, rig=replace(robot.rig, loose=bool(loose)), controller=controller)
+    return replace(robot, rig=replace(robot.rig, loose=bool(two_bodies)), controller=controller)
 
 
 def _check_setting(where: str, name: str, value: Any) -> Any:
@@ -428,8 +430,8 @@ def _check_pairs(robot: Robot, where: str) -> None:
             f"{where}, battery.voltage_cutoff: got {robot.battery.voltage_cutoff:g}; expected less than "
             f"voltage_charge, {robot.battery.voltage_charge:g} V"
         )
-    if refused := power.cutoff_error(robot.battery):
-        raise BadConfiguration(f"{where}, battery.voltage_cutoff: {refused}")
+    if fault := power.cutoff_error(robot.battery):
+        raise BadConfiguration(f"{where}, battery.voltage_cutoff: {fault}")
     for name, load in robot.configurations.items():
         if isinstance(load, Shaft):
             continue
@@ -440,10 +442,11 @@ def _check_pairs(robot: Robot, where: str) -> None:
                 f"expected more than speed_static, {float(friction.speed_static):g} m/s"
             )
     for effect in robot.effects:
-        ends = params.values_by_name(effect)
-        if effect.name in effects.UNNAMED and "low" in ends and not ends["low"] < ends["high"]:
+        values = params.values_by_name(effect)
+        if effect.name in effects.UNNAMED and "low" in values and not values["low"] < values["high"]:
             raise BadConfiguration(
-                f"{where}, effects.{effect.name}.high: got {ends['high']:g}; expected more than low, {ends['low']:g}"
+                f"{where}, effects.{effect.name}.high: got {values['high']:g}; expected more than low, "
+                f"{values['low']:g}"
             )
 
 
@@ -489,33 +492,33 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, str]]:
+def _lines_of_parameters(robot: Robot, base_robot: Robot) -> Iterator[tuple[str, str]]:
     """Table and line of each parameter that a file must state because it differs from the base robot."""
-    inherits, start = robot.rig.inherits, params.values_by_name(nothing)
-    needed = {*rig_file.required_parameters(robot.rig, params.values_by_name(robot))}
-    needed |= {*nothing.rig.unknown} - {*robot.rig.unknown}
-    needed |= frozenset() if inherits else robot.rig.stated
+    inherits, base_values = robot.rig.inherits, params.values_by_name(base_robot)
+    required = {*rig_file.required_parameters(robot.rig, params.values_by_name(robot))}
+    required |= {*base_robot.rig.unknown} - {*robot.rig.unknown}
+    required |= frozenset() if inherits else robot.rig.stated
     sds = {(name, mean): sd for name, mean, sd in robot.rig.priors}
-    always = (*(f"{name}." for name in robot.configurations), "effects.")
+    stated_prefixes = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk_parameters(robot):
         name, spec, value = parameter.name, parameter.spec, float(parameter.value)
         table, _, key = name.rpartition(".")
         if table.startswith("rig."):  # the start of a table's runs is no property of the robot
             continue
-        was = start.get(name, 0.0 if table.startswith("effects.") else None)
-        is_needed = value != was or name in needed or name.startswith(always)
+        base_value = base_values.get(name, 0.0 if table.startswith("effects.") else None)
+        is_needed = value != base_value or name in required or name.startswith(stated_prefixes)
         if not is_needed and (not inherits or table == "rig"):
             continue
         origin = ""
-        if inherits and was is not None:
-            origin = f"; {spec.source}" if value == was else f"; nominal {was:g}: {spec.source}"
+        if inherits and base_value is not None:
+            origin = f"; {spec.source}" if value == base_value else f"; nominal {base_value:g}: {spec.source}"
         text, sd = repr(value), sds.get((name, value))  # unless the prior's centre was changed
         if sd is not None:
             text = f'"{value!r} ± {sd!r}"'
         yield table, f"{key} = {text}  # [{spec.unit}] {spec.meaning}{origin}"
 
 
-def _setting_lines(robot: Robot, nothing: Robot, tables: set[str]) -> Iterator[tuple[str, str]]:
+def _setting_lines(robot: Robot, base_robot: Robot, tables: set[str]) -> Iterator[tuple[str, str]]:
     """Table and line of each rating, switch and choice that differs from those of the base robot.
 
     Args:
@@ -525,11 +528,11 @@ def _setting_lines(robot: Robot, nothing: Robot, tables: set[str]) -> Iterator[t
         part, _, key = name.partition(".")
         if isinstance(allowed, range):
             continue
-        setting, usual = (getattr(getattr(owner, part), key, None) for owner in (robot, nothing))
-        is_needed = setting != usual or (robot.rig.inherits and not isinstance(allowed[0], str))
+        setting, base_setting = (getattr(getattr(owner, part), key, None) for owner in (robot, base_robot))
+        is_needed = setting != base_setting or (robot.rig.inherits and not isinstance(allowed[0], str))
         is_needed |= key == "capacity_curve" and part in tables  # otherwise it would follow from the capacity
         if setting is None or not is_needed:
             continue
         tables = tables | {part}
-        text = f"[{unit}] {meaning if robot.rig.inherits else meaning.partition(';')[0]}" if unit else meaning
-        yield part, f"{key} = {toml_value(setting)}  # {text}"
+        comment = f"[{unit}] {meaning if robot.rig.inherits else meaning.partition(';')[0]}" if unit else meaning
+        yield part, f"{key} = {toml_value(setting)}  # {comment}"

@@ -76,13 +76,13 @@ def drop_repeated_readings(
     """
     if (np.diff(values) == 0).sum() < LEAST * len(values):
         return values, 0.0
-    names = np.zeros(len(values), int) if run is None else np.unique(run, return_inverse=True)[1]
-    order = np.lexsort((time, names))
-    recordings = np.split(order, np.flatnonzero(np.diff(names[order])) + 1)
+    run_index = np.zeros(len(values), int) if run is None else np.unique(run, return_inverse=True)[1]
+    order = np.lexsort((time, run_index))
+    recordings = np.split(order, np.flatnonzero(np.diff(run_index[order])) + 1)
     periods = np.array([reading_period(values[rows]) for rows in recordings])
     is_slow = periods > 0
-    of_period = sum(len(rows) for rows, slow in zip(recordings, is_slow, strict=True) if slow)
-    if not is_slow.any() or of_period < 0.5 * len(values) or periods[is_slow].min() < ALIKE * periods.max():
+    slow_rows = sum(len(rows) for rows, slow in zip(recordings, is_slow, strict=True) if slow)
+    if not is_slow.any() or slow_rows < 0.5 * len(values) or periods[is_slow].min() < ALIKE * periods.max():
         return values, 0.0
     rows_apart = float(np.median(periods[is_slow]))
     first_readings = np.full(len(values), np.nan)
@@ -90,10 +90,10 @@ def drop_repeated_readings(
         finite_rows = rows[np.isfinite(values[rows])]
         begins = np.flatnonzero(np.concatenate([[True], np.diff(values[finite_rows]) != 0]))[: len(finite_rows)]
         lengths = np.diff(np.append(begins, len(finite_rows)))
-        times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # two readings may be equal
-        again = np.arange(times.sum()) - np.repeat(np.cumsum(times) - times, times)
-        first = np.repeat(begins, times) + np.round(again * rows_apart).astype(int)
-        nearest = finite_rows[np.minimum(first, len(finite_rows) - 1)]
+        counts = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # two readings may be equal
+        repetition = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        offsets = np.repeat(begins, counts) + np.round(repetition * rows_apart).astype(int)
+        nearest = finite_rows[np.minimum(offsets, len(finite_rows) - 1)]
         first_readings[nearest] = values[nearest]
     return first_readings, rows_apart
 
@@ -124,8 +124,10 @@ def with_default_columns(runs: Runs) -> Runs:
         columns["configuration"] = np.full(len(runs), configuration)
     if layout.imposed_column == SPEED and all(map(runs.has, SPEEDS)):
         columns[SPEED] = np.mean([runs[c] for c in SPEEDS], 0)
-    usual = {column: np.full(len(runs), value) for column, value in {**DEFAULTS, SUPPLY: layout.supply}.items()}
-    return runs.with_columns(columns | {c: values for c, values in usual.items() if not runs.has(c)})
+    default_columns = {
+        column: np.full(len(runs), value) for column, value in {**DEFAULTS, SUPPLY: layout.supply}.items()
+    }
+    return runs.with_columns(columns | {c: values for c, values in default_columns.items() if not runs.has(c)})
 
 
 def contradictions_in_rows(runs: Runs) -> Iterator[Check]:
@@ -160,18 +162,18 @@ def without_repeated_rows(runs: Runs) -> Runs:
     """Log without rows that repeat the row before, and a note on them."""
     if not runs.sampled:
         return runs
-    again = np.flatnonzero(np.diff(runs["time_s"]) == 0) + 1
+    repeated = np.flatnonzero(np.diff(runs["time_s"]) == 0) + 1
     for values in runs.columns.values():
-        after, before = values[again], values[again - 1]
-        is_equal = after == before
+        values_there, before = values[repeated], values[repeated - 1]
+        is_equal = values_there == before
         if values.dtype.kind == "f":
-            is_equal |= np.isnan(after) & np.isnan(before)
-        again = again[is_equal]
-    if not again.size:
+            is_equal |= np.isnan(values_there) & np.isnan(before)
+        repeated = repeated[is_equal]
+    if not repeated.size:
         return runs
     is_distinct = np.full(len(runs), True)
-    is_distinct[again] = False
-    note = f"{_rows_are(again)} a repetition of the row before, with the same time. Repetitions are left out"
+    is_distinct[repeated] = False
+    note = f"{_rows_are(repeated)} a repetition of the row before, with the same time. Repetitions are left out"
     return runs.where(is_distinct).with_columns({}, f"{runs.source}: {note} and not counted")
 
 
@@ -210,7 +212,7 @@ def split_at_jumps(runs: Runs, at_rest: bool) -> Runs:
     jumps = np.flatnonzero((steps if at_rest else np.abs(steps)) > JUMP * usual) + 1
     if usual == 0 or not 0 < len(jumps) <= MOST_JUMPS:
         return runs
-    first, rows = steps[jumps[0] - 1], ", ".join(str(k + 1) for k in jumps)
+    first_step, row_numbers = steps[jumps[0] - 1], ", ".join(str(k + 1) for k in jumps)
     columns, consequence = dict[str, np.ndarray](), "A new run begins there"
     if at_rest:
         consequence = (
@@ -225,8 +227,9 @@ def split_at_jumps(runs: Runs, at_rest: bool) -> Runs:
         columns = {"time_s": time, "run_id": run}
     return runs.with_columns(
         columns,
-        f"{runs.source} row {rows}, time_s: {three_digits(abs(first))} s {'after' if first > 0 else 'earlier than'} "
-        f"the row before it, where {three_digits(usual)} s is usual. {consequence}",
+        f"{runs.source} row {row_numbers}, time_s: {three_digits(abs(first_step))} s "
+        f"{'after' if first_step > 0 else 'earlier than'} the row before it, where {three_digits(usual)} s is "
+        f"usual. {consequence}",
     )
 
 
@@ -243,7 +246,8 @@ def without_time_of_settled_rows(runs: Runs, robot: Robot) -> Runs:
     """
     time = runs.columns.get("time_s", np.zeros(0))
     step = np.diff(time)
-    apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(runs)
+    apart = float(step[step > 0].min(initial=math.inf))
+    clamped = _is_clamped(runs)
     windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
     constant = windings if clamped else time_constant(robot)
     if (
@@ -255,8 +259,10 @@ def without_time_of_settled_rows(runs: Runs, robot: Robot) -> Runs:
         return runs
     why = "the output is held in every row"
     if not clamped:
-        settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" * (constant > 0)
-        why = f"rows are {three_digits(apart)} s or more apart, mostly at different settings{settle}"
+        settling_words = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" * (
+            constant > 0
+        )
+        why = f"rows are {three_digits(apart)} s or more apart, mostly at different settings{settling_words}"
     note = f"{runs.source}: {why}, so each row is read as a settled run and its time is ignored"
     return runs.without_columns((*TIME, "run_id")).with_columns({}, note)
 
@@ -280,11 +286,11 @@ def _are_separate_settings(runs: Runs, apart: float) -> bool:
     changed = np.any([np.diff(x) != 0 for x in settings], 0)
     if not all(c.settled for c in runs.present_channels) or changed.mean() < 0.5:
         return False
-    others = settings[1 + runs.has("duty") :]
-    acting = np.stack([np.ones(len(runs)), runs.commanded, *others], 1)
+    loads = settings[1 + runs.has("duty") :]
+    regressors = np.stack([np.ones(len(runs)), runs.commanded, *loads], 1)
     return all(
-        _unexplained_squares(runs[c.column][1:], acting[1:])
-        <= 2 * _unexplained_squares(runs[c.column][1:], acting[:-1])
+        _unexplained_squares(runs[c.column][1:], regressors[1:])
+        <= 2 * _unexplained_squares(runs[c.column][1:], regressors[:-1])
         for c in runs.present_channels
     )
 
@@ -306,7 +312,8 @@ def inertia_at_motor(robot: Robot, load: Load) -> float:
 
 def time_constant(robot: Robot) -> float:
     """Time constant J R/k² of the motor speed with the slowest load [s]. Infinite if unknown."""
-    motor, slowest = robot.motor, 0.0
+    motor = robot.motor
+    slowest = 0.0
     if not robot.knows(VOLTAGE):
         return math.inf
     for load in robot.configurations.members:
@@ -327,9 +334,9 @@ def without_idle_rows(runs: Runs) -> Runs:
     if runs.turns:
         slope = runs["slope_deg"]
         sloped = int(np.count_nonzero(slope))
-        rows_text = f", as in {sloped} of {len(slope)} rows" if sloped > 1 else ""
+        count_words = f", as in {sloped} of {len(slope)} rows" if sloped > 1 else ""
         why = (
-            f" in a table of settled turns{rows_text}; expected 0, since a turn never settles on a slope. To "
+            f" in a table of settled turns{count_words}; expected 0, since a turn never settles on a slope. To "
             "simulate one: simulate --model drive --left --right --slope"
         )
         runs.check_rows([("slope_deg", slope, why)])
@@ -339,67 +346,70 @@ def without_idle_rows(runs: Runs) -> Runs:
 
 
 def _without_idle_rows(runs: Runs) -> Runs:
-    sides, layout = [c for c in runs.layout.sides if runs.has(c)], runs.layout
-    size = np.max(np.abs([runs[c] for c in sides]), 0) if sides else np.abs(runs.commanded)
+    layout = runs.layout
+    sides = [c for c in layout.sides if runs.has(c)]
+    drive = np.max(np.abs([runs[c] for c in sides]), 0) if sides else np.abs(runs.commanded)
     if layout.imposed == "motor_speed" and runs.has(LOAD):  # a shaft at rest may push against its load
-        size = size + np.abs(runs[LOAD])
+        drive = drive + np.abs(runs[LOAD])
     if layout.imposed == "voltage" and sides:
-        size = size * np.abs(runs[SUPPLY])
-    idle = np.flatnonzero(size == 0)
+        drive = drive * np.abs(runs[SUPPLY])
+    idle = np.flatnonzero(drive == 0)
     if not idle.size:
         return runs
     drive_columns = (layout.imposed_column, *sides, *["duty"] * runs.has("duty"))
-    zero = " and ".join(c for c in drive_columns if not runs[c][idle].any())
-    why = f" although {zero} is 0; give the command that drives it, or remove the row"
+    zero_columns = " and ".join(c for c in drive_columns if not runs[c][idle].any())
+    why = f" although {zero_columns} is 0; give the command that drives it, or remove the row"
     for channel in (c for c in runs.present_channels if c.zero_at_rest):
         readings = np.abs(np.nan_to_num(runs[channel.column]))
-        moving = (size == 0) & (readings > STILL * np.max(readings))
+        moving = (drive == 0) & (readings > STILL * np.max(readings))
         runs.check_rows([(channel.column, moving & ~moving.all(), why)])
-    if idle.size == len(size):
-        clamp = (
+    if idle.size == len(drive):
+        clamp_advice = (
             '; if the shaft is locked, set imposed = "motor_current" or "voltage", and give the columns held '
             "(1) and output_torque"
         )
         raise BadData(
-            f"{runs.source}: {zero} is 0 in every row, so nothing drives the motors; expected rows with a "
-            f"command{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
+            f"{runs.source}: {zero_columns} is 0 in every row, so nothing drives the motors; expected rows with a "
+            f"command{clamp_advice * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
         )
-    why = f"nothing drives the motors ({zero or layout.imposed_column} is 0)"
+    why = f"nothing drives the motors ({zero_columns or layout.imposed_column} is 0)"
     note = f"{runs.source}: {_rows_are(idle)} left out, since {why}. Row numbers do not count them"
-    return runs.where(size != 0).with_columns({}, note)
+    return runs.where(drive != 0).with_columns({}, note)
 
 
 def _missing_signs(runs: Runs) -> Iterator[Check]:
     """Checks for unsigned readings in rows that drive the robot backward."""
     imposed, layout, unit = runs.commanded, runs.layout, runs.layout.imposed_column.split("_")[-1]
 
-    def place(end: str) -> Callable[[int], str]:
+    def message_end(end: str) -> Callable[[int], str]:
         return lambda row: f" at {imposed[row]:g} {unit}; {end}"
 
-    may_drive = layout.weight or runs.has("duty") or runs.driven_on.any()
+    load_may_drive = layout.weight or runs.has("duty") or runs.driven_on.any()
     for channel in (c for c in runs.present_channels if c.directed):
         column, readings = channel.column, runs[channel.column]
         if layout.magnitude(channel.name):
             why = "; expected no negative reading of an instrument that shows only the magnitude"
             yield column, readings < 0, why
             continue
-        if may_drive and not channel.zero_at_rest:
+        if load_may_drive and not channel.zero_at_rest:
             continue  # the load may drive a motor; a reversing bridge also reverses the supply current
         # Downhill, gravity may drive a motor. Only uphill or on the flat do current and voltage have the same sign.
         backward = (imposed < 0) & ((runs["slope_deg"] <= 0) | channel.zero_at_rest)
-        doubt = _sign_tolerance(runs, channel)
+        tolerance = _sign_tolerance(runs, channel)
         if not channel.zero_at_rest and channel.name != "motor_voltage":  # that is compared with the back-EMF instead
-            alike = "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
+            turn_advice = (
+                "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
+            )
             why = (
                 "nothing else drives the motors, so the reading should have its sign; use one sign convention in all "
-                f"rows{alike}"
+                f"rows{turn_advice}"
             )
-            yield column, (imposed > 0) & (runs["slope_deg"] >= 0) & (readings < -doubt), place(why)
+            yield column, (imposed > 0) & (runs["slope_deg"] >= 0) & (readings < -tolerance), message_end(why)
         if not _rises_through_zero(imposed, readings, backward):
             why = "expected readings with their signs, negative in reverse"
             if layout.crosses_zero:
                 why += f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
-            yield column, backward & (readings > (doubt if layout.crosses_zero else 0.0)), place(why)
+            yield column, backward & (readings > (tolerance if layout.crosses_zero else 0.0)), message_end(why)
 
 
 def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.ndarray) -> bool:
@@ -408,12 +418,12 @@ def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.
 
     Unsigned readings would mirror the forward readings and fall towards zero.
     """
-    read = backward & np.isfinite(readings)
-    if len(np.unique(imposed[read])) < LEVELS_OF_SIGN:
+    is_read = backward & np.isfinite(readings)
+    if len(np.unique(imposed[is_read])) < LEVELS_OF_SIGN:
         return False
-    levels = imposed[read] - imposed[read].mean()
-    slope = levels @ readings[read] / (levels @ levels)
-    scatter = np.std(readings[read] - readings[read].mean() - slope * levels)
+    levels = imposed[is_read] - imposed[is_read].mean()
+    slope = levels @ readings[is_read] / (levels @ levels)
+    scatter = np.std(readings[is_read] - readings[is_read].mean() - slope * levels)
     return bool(slope * np.ptp(levels) > 2 * scatter)
 
 
@@ -438,23 +448,23 @@ def missing_data_notes(runs: Runs) -> Iterator[str]:
             )
     if runs.sampled:
         return
-    alike: dict[tuple[Any, ...], list[int]] = {}
+    rows_by_cells: dict[tuple[Any, ...], list[int]] = {}
     cells_by_column = [columns[c].tolist() for c in columns if c not in ("run_id", *WHEN)]
     for row, cells in enumerate(zip(*cells_by_column, strict=True), 1):
-        alike.setdefault(cells, []).append(row)
-    copied = [rows for rows in alike.values() if len(rows) > 1]
+        rows_by_cells.setdefault(cells, []).append(row)
+    copied = [rows for rows in rows_by_cells.values() if len(rows) > 1]
     if copied:
         others = f", as do {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
             f"{name}: rows {copied[0][0]} and {copied[0][1]} have the same conditions and readings{others}. They "
             "count as repeats. Remove copies"
         )
-    run_ids, times = np.unique(columns.get("run_id", np.zeros(0, str)), return_counts=True)
-    several = times > 1
-    if several.any():
-        run = run_ids[np.argmax(several)]
+    run_ids, counts = np.unique(columns.get("run_id", np.zeros(0, str)), return_counts=True)
+    is_repeated = counts > 1
+    if is_repeated.any():
+        run = run_ids[np.argmax(is_repeated)]
         rows = rows_text(np.flatnonzero(columns["run_id"] == run).tolist(), 5, " and more").removeprefix("rows ")
-        others = f", and {several.sum() - 1} more run_ids are repeated" if several.sum() > 1 else ""
+        others = f", and {is_repeated.sum() - 1} more run_ids are repeated" if is_repeated.sum() > 1 else ""
         yield (
             f"{name}: run_id {run} is in rows {rows}{others}. Without {', '.join(TIME)} every row is a separate run"
         )
@@ -462,10 +472,10 @@ def missing_data_notes(runs: Runs) -> Iterator[str]:
 
 def driven_backward_notes(runs: Runs) -> Iterator[str]:
     """Note on settled rows in which an unsigned load torque drives a shaft backward."""
-    on = np.flatnonzero(runs.driven_on)
-    if on.size and not runs.sampled and runs[LOAD].min() >= 0:
-        rows_text = f", as in {on.size} rows" if on.size > 1 else ""
+    pushed_rows = np.flatnonzero(runs.driven_on)
+    if pushed_rows.size and not runs.sampled and runs[LOAD].min() >= 0:
+        count_words = f", as in {pushed_rows.size} rows" if pushed_rows.size > 1 else ""
         yield (
-            f"{runs.place(on[0])}, {LOAD}: got {runs[LOAD][on[0]]:g} where the shaft is driven "
-            f"backward{rows_text}: here it drives the shaft. The torque of a brake is negative for backward motion"
+            f"{runs.place(pushed_rows[0])}, {LOAD}: got {runs[LOAD][pushed_rows[0]]:g} where the shaft is driven "
+            f"backward{count_words}: here it drives the shaft. The torque of a brake is negative for backward motion"
         )

@@ -131,7 +131,7 @@ def runs_of_arrays(
     if not arrays.header:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
-    header, layout, capitals = column_names.match_column_names(
+    header, layout, spelling_notes = column_names.match_column_names(
         name, arrays.header, layout, inferred=robot is None, of_turns=of_turns
     )
     meanings = layout.meanings(name, header)
@@ -142,7 +142,7 @@ def runs_of_arrays(
     if not len(arrays):
         raise BadData(f"{name}: a header without rows; expected at least one run")
     arrays = clock.drop_empty_rows(arrays, meanings)
-    columns, changed = _column_values(arrays, meanings, layout, battery)
+    columns, cell_notes = _column_values(arrays, meanings, layout, battery)
     unread = {
         c: _values_without_role(raw) for c, m, raw in zip(header, meanings, arrays.values, strict=True) if m is None
     }
@@ -169,7 +169,7 @@ def runs_of_arrays(
         runs = row_checks.without_idle_rows(runs)
     if not any(map(runs.has, WHEN)):
         runs = runs.with_columns({"order": np.arange(1.0, len(runs) + 1)})
-    notes = [*capitals, *changed]
+    notes = [*spelling_notes, *cell_notes]
     if measured:
         notes += row_checks.missing_data_notes(runs)
     notes += row_checks.driven_backward_notes(runs)
@@ -187,28 +187,28 @@ def _column_values(
 ) -> tuple[Columns, Names]:
     """Values of the known columns, and notes on changed cells."""
     columns: Columns = {}
-    bad: list[tuple[int, int, Column, Raw]] = []
+    refused_cells: list[tuple[int, int, Column, Raw]] = []
     notes: list[str] = []
     count = 0
     by_name = {m.column: raw for m, raw in zip(meanings, arrays.values, strict=True) if m is not None}
     for j, (meaning, raw) in enumerate(zip(meanings, arrays.values, strict=True)):
         if meaning is None:
             continue
-        changed: Names = ()
+        cell_notes: Names = ()
         if meaning.column == "configuration":
-            raw, changed = _match_configuration_case(arrays.name, column_texts(raw), layout)
+            raw, cell_notes = _match_configuration_case(arrays.name, column_texts(raw), layout)
         if meaning.column in TIME:
             runs = column_texts(by_name["run_id"]) if "run_id" in by_name else None
-            raw, changed = clock.time_since_start(arrays.name, meaning, raw, runs)
-        notes += changed
+            raw, cell_notes = clock.time_since_start(arrays.name, meaning, raw, runs)
+        notes += cell_notes
         if (battery and meaning.column == SUPPLY and layout.imposed == "voltage") or meaning.column in layout.idle:
             _reject_readings(arrays, meaning, raw, layout)
             continue
         columns[meaning.column], refused = column_names.convert_column(meaning, raw, layout)
         count += int(refused.sum())
-        bad += [(row, j, meaning, raw) for row in np.flatnonzero(refused)[:LISTED].tolist()]
-    if bad:
-        (row, _, meaning, raw), *others = sorted(bad, key=lambda cell: cell[:2])[:LISTED]
+        refused_cells += [(row, j, meaning, raw) for row in np.flatnonzero(refused)[:LISTED].tolist()]
+    if refused_cells:
+        (row, _, meaning, raw), *others = sorted(refused_cells, key=lambda cell: cell[:2])[:LISTED]
         cell = column_texts(raw[row : row + 1])[0]
         sentence = column_names.refused_cell_sentence(arrays.row(row), meaning, cell, layout)
         also = f"; also {', '.join(f'row {k + 1}, {m.shown}' for k, _, m, _ in others)}" if others else ""
@@ -218,10 +218,10 @@ def _column_values(
 
 def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], Names]:
     """Names of configurations with the capitals of the robot file, and notes on changed names."""
-    meant = {c.casefold(): c for c in layout.configurations}
-    if len(meant) < len(layout.configurations):  # the names differ only in capitals
+    names_by_casefold = {c.casefold(): c for c in layout.configurations}
+    if len(names_by_casefold) < len(layout.configurations):  # the names differ only in capitals
         return cells, ()
-    renamed = {c: meant.get(c.casefold(), c) for c in dict.fromkeys(cells)}
+    renamed = {c: names_by_casefold.get(c.casefold(), c) for c in dict.fromkeys(cells)}
     notes = tuple(f"{name}: configuration {c} is read as {right}" for c, right in renamed.items() if c != right)
     return [renamed[c] for c in cells], notes
 
@@ -272,6 +272,6 @@ def single_run(cells: Json, layout: Layout | None) -> Runs:
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
-        total = f"option, total_mass_kg: got {cells['total_mass_kg']:g}"
-        raise BadConfiguration(total + row_checks.too_light(cells["payload_kg"]))
+        total_text = f"option, total_mass_kg: got {cells['total_mass_kg']:g}"
+        raise BadConfiguration(total_text + row_checks.too_light(cells["payload_kg"]))
     return Runs("the options", columns, layout=layout)

@@ -97,8 +97,8 @@ class Signal:
         return float(np.isfinite(self.shown).mean())
 
 
-#: Current needed to accelerate the motors of a configuration: channels of a speed and a current (empty if the current
-#: is imposed), current [A] for one unit of the speed column per second, and the smallest current to which shares
+#: Current needed to accelerate the motors of a configuration. Channels of a speed and of a current (empty if the
+#: current is imposed). Current [A] for one unit of the speed column per second. Smallest current to which shares
 #: refer [A].
 Inertia = tuple[str, str, float, float]
 
@@ -175,7 +175,7 @@ class Settled:
     def points(self) -> int:
         """Number of operating points: settled runs with different drives or conditions."""
         step = DRIFT * float(np.max(np.abs(applied_drive(self.runs))))
-        return len({(round(s.imposed / step), *_point_of(self.runs, s)) for s in self.kept})
+        return len({(round(s.imposed / step), *_operating_point(self.runs, s)) for s in self.kept})
 
     def settled_runs(self) -> Runs:
         """Settled runs, in the form of a table from a file."""
@@ -194,17 +194,17 @@ class Settled:
         for name in (name for name in means if name not in omitted):
             cells = [means[name][s.rows] for s in stretches]
             is_number = means[name].dtype.kind == "f"
-            columns[name] = np.array([_digits(_plain(x)) if is_number else str(x[0]) for x in cells])
+            columns[name] = np.array([_rounded(_finite_mean(x)) if is_number else str(x[0]) for x in cells])
         for channel in (s.channel for s in self.signals):
             if any(math.isfinite(s.mean[channel.name]) for s in stretches):
-                columns[channel.column] = np.array([_digits(s.mean[channel.name]) for s in stretches])
-                columns[channel.sd_column] = np.array([_digits(s.sd[channel.name], 3) for s in stretches])
+                columns[channel.column] = np.array([_rounded(s.mean[channel.name]) for s in stretches])
+                columns[channel.sd_column] = np.array([_rounded(s.sd[channel.name], 3) for s in stretches])
         columns["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in stretches])
         columns["order"] = np.arange(1.0, len(stretches) + 1)
         return columns
 
 
-def _digits(x: float, digits: int = 7) -> float:
+def _rounded(x: float, digits: int = 7) -> float:
     return float(f"{x:.{digits}g}") if math.isfinite(x) else math.nan
 
 
@@ -275,13 +275,13 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
         gaps += rows[rows_of_gaps].tolist()
         levels += np.split(rows, rows_of_gaps + 1)
     for driver in (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else [])):
-        levels = [x for level in levels for x in _levels_of(runs, driver, level, shortest, drift, step)]
+        levels = [x for level in levels for x in _divided_levels(runs, driver, level, shortest, drift, step)]
     signals = _settled_signals_of_log(runs, rows_by_run, levels, max(1, round(shortest / 6 / step)), drift)
     stuck = np.array([_stuck_rows(s, rows_by_run) for s in signals])
     stretches = tuple(
         _settled_end(runs, signals, drives, level, shortest, drift, step, stuck, inertia) for level in levels
     )
-    scatter = _scatter_of(runs, stretches, signals, float(np.max(np.abs(drives))))
+    scatter = _scatter_of_repeats(runs, stretches, signals, float(np.max(np.abs(drives))))
     return Settled(runs, stretches, signals, shortest, drift, tuple(gaps), scatter)
 
 
@@ -311,7 +311,7 @@ def _rows_by_run(runs: Runs) -> list[np.ndarray]:
 
 
 def _settled_signals_of_log(
-    runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
+    runs: Runs, rows_by_run: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
 ) -> tuple[Signal, ...]:
     """Returns the readings of each channel of settled runs. If only an angle is measured, its rate."""
     width = min(max(6 * half, BESIDE[0]), BESIDE[1])
@@ -329,7 +329,7 @@ def _settled_signals_of_log(
         readings, angles, step = np.where(is_glitch, np.nan, raw), np.zeros(0), 0.0
         if factor:
             angles, readings = readings * factor, np.full(len(runs), np.nan)
-            for rows in each:
+            for rows in rows_by_run:
                 # rate over the last `2 * half` samples, so that samples after a level do not affect its end
                 time, x, k = runs["time_s"][rows], angles[rows], np.arange(len(rows))
                 first_row, last_row = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
@@ -343,7 +343,7 @@ def _settled_signals_of_log(
 
 
 def find_glitches(
-    shown: np.ndarray, levels: list[np.ndarray], width: int, step: float, drift: float | None
+    readings: np.ndarray, levels: list[np.ndarray], width: int, step: float, drift: float | None
 ) -> np.ndarray:
     """True for readings far from their neighbours, shape (rows,).
 
@@ -355,7 +355,7 @@ def find_glitches(
     may be a start, so `PART` of them in a row are no glitches.
 
     Args:
-        shown: readings, NaN if missing.
+        readings: readings, NaN if missing.
         levels: rows of each level, in the order of time.
         width: number of readings in a median.
         step: step of the instrument [unit of the readings].
@@ -363,26 +363,28 @@ def find_glitches(
     """
     from scipy.ndimage import binary_opening, median_filter
 
-    is_glitch, largest = np.zeros(len(shown), bool), _reading_size(shown)
+    is_glitch = np.zeros(len(readings), bool)
+    largest = _reading_size(readings)
     for rows in levels:
-        rows = rows[np.isfinite(shown[rows])]
+        rows = rows[np.isfinite(readings[rows])]
         if len(rows) < FEWEST:
             continue
-        size = min(width, len(rows)) | 1
-        x, pad = shown[rows], size // 2
+        window = min(width, len(rows)) | 1
+        x, pad = readings[rows], window // 2
         # A level is padded with its end values: if it were mirrored, a start would appear as a glitch.
         ends = np.full(pad, np.median(x[:PART])), np.full(pad, np.median(x[-PART:]))
-        middle = median_filter(np.concatenate([ends[0], x, ends[1]]), size)[pad : pad + len(x)]
+        middle = median_filter(np.concatenate([ends[0], x, ends[1]]), window)[pad : pad + len(x)]
         deviation = np.abs(x - middle)
-        scatter = 1.4826 * median_filter(deviation, min(5 * size, len(x)) | 1, mode="reflect")
-        grain = max(step, float(np.diff(np.unique(x)).min())) if np.ptp(x) > 0 else step  # coarse despite the file
-        noise = FAR * np.maximum(scatter, grain)
+        scatter = 1.4826 * median_filter(deviation, min(5 * window, len(x)) | 1, mode="reflect")
+        # Readings may be coarse although the file states no step.
+        coarse_step = max(step, float(np.diff(np.unique(x)).min())) if np.ptp(x) > 0 else step
+        noise = FAR * np.maximum(scatter, coarse_step)
         if drift is None:
-            is_far = deviation > np.maximum(noise, 0.5 * size * np.median(np.abs(np.diff(x))))
+            is_far = deviation > np.maximum(noise, 0.5 * window * np.median(np.abs(np.diff(x))))
         else:
             allowed = np.maximum(noise, np.maximum(drift * np.abs(middle), FINE * largest))
             is_far = (deviation > allowed) & (np.abs(middle) > STILL * largest)
-        is_far[:size] &= ~binary_opening(is_far[:size], np.ones(PART))
+        is_far[:window] &= ~binary_opening(is_far[:window], np.ones(PART))
         is_glitch[rows] = is_far
     return is_glitch
 
@@ -391,23 +393,23 @@ def find_glitches(
 RATES = (("output_angle_deg", "output_speed", 1 / 6), ("position_mm", "speed", 1.0))
 
 
-def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
+def _step_of_instrument(runs: Runs, channel: Channel, readings: np.ndarray) -> float:
     """Step of a channel's instrument [unit of the column], from its readings or else from the file.
 
     If neither gives one and most readings repeat, it is their smallest difference.
     """
     quanta = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
-    if step := common_step(shown) or next(quanta, 0.0) / channel.factor:
+    if step := common_step(readings) or next(quanta, 0.0) / channel.factor:
         return step
-    levels = np.unique(shown[np.isfinite(shown)])
-    coarse = 1 < len(levels) < COARSE * np.isfinite(shown).sum()
+    levels = np.unique(readings[np.isfinite(readings)])
+    coarse = 1 < len(levels) < COARSE * np.isfinite(readings).sum()
     return float(np.median(np.diff(levels)[np.diff(levels) < 1.5 * np.diff(levels).min()])) if coarse else 0.0
 
 
-def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
+def _stuck_rows(signal: Signal, rows_by_run: list[np.ndarray]) -> np.ndarray:
     """Rows in which a channel shows only 0 or repeats one number for longer than noise allows."""
     is_stuck = np.full(len(signal.shown), signal.largest == 0)
-    for rows in each if not len(signal.angle) else ():
+    for rows in rows_by_run if not len(signal.angle) else ():
         readings = signal.shown[rows]
         repeats = np.diff(readings) == 0
         if not len(repeats):
@@ -425,7 +427,7 @@ def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
 # --- levels and stretches -------------------------------------------------------------------------------
 
 
-def _levels_of(
+def _divided_levels(
     runs: Runs, drives: np.ndarray, rows: np.ndarray, shortest: float, drift: float, step: float
 ) -> Iterator[np.ndarray]:
     """Rows of a part without gaps, divided wherever a condition changes, or `drives` by more than its noise.
@@ -441,21 +443,21 @@ def _levels_of(
     largest, noise = float(np.max(np.abs(drives))), 0.0
     if len(changes):  # robust to steps, 0 if most samples equal the sample before
         noise = 1.4826 * float(np.median(np.abs(changes - np.median(changes)))) / math.sqrt(2)
-    size = 1 if noise <= 1e-9 * largest else max(1, min(round(shortest / step / 6), 64))
+    block_size = 1 if noise <= 1e-9 * largest else max(1, min(round(shortest / step / 6), 64))
     begin, mean, count = 0, float(x[0]), 0
-    starts = np.arange(0, len(rows), size)
+    starts = np.arange(0, len(rows), block_size)
     sizes = np.diff(starts, append=len(rows))
     # Lists are faster here, and a log may have a million rows.
     blocks = (starts, sizes, np.add.reduceat(x, starts) / sizes, np.logical_or.reduceat(cuts, starts))
-    for k, more, value, cut in zip(*(block.tolist() for block in blocks), strict=True):
-        tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * noise / math.sqrt(size))
-        if count and (abs(value - mean) > tolerance or cut):
+    for k, samples, value, is_cut in zip(*(block.tolist() for block in blocks), strict=True):
+        tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * noise / math.sqrt(block_size))
+        if count and (abs(value - mean) > tolerance or is_cut):
             # the last averaged samples may belong to the next level
-            yield rows[begin : k - size if size > 1 and k - begin > 3 * size else k]
-            begin, mean, count = k, value, more
+            yield rows[begin : k - block_size if block_size > 1 and k - begin > 3 * block_size else k]
+            begin, mean, count = k, value, samples
         else:
-            mean = (mean * count + value * more) / (count + more)
-            count += more
+            mean = (mean * count + value * samples) / (count + samples)
+            count += samples
     yield rows[begin:]
 
 
@@ -475,50 +477,51 @@ def _settled_end(
     begin, end, imposed = float(time[rows[0]]), float(time[rows[-1]]), float(np.mean(drives[rows]))
     level = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
 
-    def out(why: str, channel: str = "", size: float = 0.0) -> Stretch:
+    def omitted(why: str, channel: str = "", size: float = 0.0) -> Stretch:
         return replace(level, why=why, channel=channel, size=size)
 
     if runs.has("mode") and str(runs["mode"][rows[0]]) != "voltage":
-        return out("undriven")
+        return omitted("undriven")
     if end - begin + step < shortest or len(rows) < FEWEST:
-        return out("changes" if len(rows) < FEWEST else "short")
+        return omitted("changes" if len(rows) < FEWEST else "short")
     if abs(imposed) <= STILL * float(np.max(np.abs(drives))):
-        return out("idle")
+        return omitted("idle")
     names = [s.channel.name for s in signals]
     for name, is_stuck in zip(names, stuck, strict=True):
         if is_stuck[rows].mean() > 0.5:
-            return out("stuck", name)
+            return omitted("stuck", name)
     end_rows, means, left_over = _best_end(signals, time, rows, shortest, drift)
     glitches = [int(s.glitches[end_rows].sum()) for s in signals]
     for signal, (mean, sd, change), count in zip(signals, means, glitches, strict=True):
         if count > MOST_GLITCHES * len(end_rows):
-            return out("glitches", signal.channel.name, count / len(end_rows))
+            return omitted("glitches", signal.channel.name, count / len(end_rows))
         if not math.isfinite(mean):
             continue
         if abs(change) > max(drift * abs(mean), FINE * signal.largest) + SDS * OF_CHANGE * sd:
-            return out("settling", signal.channel.name, abs(change) / max(abs(mean), FINE * signal.largest))
-        to_come = _to_come(signal, rows, mean)
+            return omitted("settling", signal.channel.name, abs(change) / max(abs(mean), FINE * signal.largest))
+        to_come = _remaining_change(signal, rows, mean)
         if to_come > drift:
-            return out("settling", signal.channel.name, to_come)
+            return omitted("settling", signal.channel.name, to_come)
         left_over = max(left_over, to_come)
     if np.isnan(means).all():
-        return out("unread")
+        return omitted("unread")
     is_moving = [
         abs(mean) >= max(STILL * s.largest, SDS * sd)
         for s, (mean, sd, _) in zip(signals, means, strict=True)
         if s.channel.zero_at_rest and s.channel.name not in OF_YAW and math.isfinite(mean)
     ]
     if is_moving and not any(is_moving):
-        return out("rest")
+        return omitted("rest")
     by_name = {name: x for name, x in zip(names, means.tolist(), strict=True) if math.isfinite(x[0])}
     speed, current, per_rate, least = inertia.get(str(runs["configuration"][rows[0]]), ("", "", 0.0, 0.0))
     if speed in by_name and (not current or current in by_name):
-        a_second = per_rate / float(time[end_rows[-1]] - time[end_rows[0]])
+        current_per_change = per_rate / float(time[end_rows[-1]] - time[end_rows[0]])
         _, sd, change = by_name[speed]
         full_scale = max(abs(by_name[current][0] if current else imposed), least)
-        share, noise = abs(a_second * change) / full_scale, OF_CHANGE * abs(a_second * sd) / full_scale
+        share = abs(current_per_change * change) / full_scale
+        noise = OF_CHANGE * abs(current_per_change * sd) / full_scale
         if share > drift + SDS * noise:
-            return out("accelerates", speed, share)
+            return omitted("accelerates", speed, share)
     mean, sd, change = means.T
     # The tail of a lag would continue by about as much again after the end, in all channels.
     sd = np.hypot(sd, left_over * _scales(signals, mean))
@@ -564,7 +567,7 @@ def _scales(signals: tuple[Signal, ...], means: np.ndarray) -> np.ndarray:
     return np.maximum(np.abs(means), [0.1 * s.largest for s in signals])
 
 
-def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
+def _remaining_change(signal: Signal, rows: np.ndarray, mean: float) -> float:
     """Change expected after the end of a level, as a share of `_scales`.
 
     It is the tail of a lag, whose decay follows from the changes between quarters of the level. If noise hides the
@@ -574,22 +577,22 @@ def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
     if min(map(len, quarters)) < PART:
         return 0.0
     first_change, earlier, later = np.diff([float(np.mean(q)) for q in quarters]).tolist()
-    place = np.arange(len(quarters[3]))  # only the last quarter: earlier ones contain a lag's decay
-    noise = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
+    index = np.arange(len(quarters[3]))  # only the last quarter: earlier ones contain a lag's decay
+    noise = quarters[3] - np.polyval(np.polyfit(index, quarters[3], 1), index)
     standard_error = SDS * math.sqrt(2 * _correlation_time(noise) / len(noise)) * float(np.std(noise))
     is_hidden = abs(later) < standard_error
     if is_hidden:
         earlier, later = first_change, earlier
     if abs(later) < standard_error or earlier * later <= 0:
         return 0.0
-    fades = min(later / earlier, 0.9)
-    last_change = min(abs(later) * fades, standard_error) if is_hidden else abs(later)
-    return last_change * fades / (1 - fades) / max(abs(mean), 0.1 * signal.largest)
+    decay = min(later / earlier, 0.9)
+    last_change = min(abs(later) * decay, standard_error) if is_hidden else abs(later)
+    return last_change * decay / (1 - decay) / max(abs(mean), 0.1 * signal.largest)
 
 
-def _reading_size(shown: np.ndarray) -> float:
+def _reading_size(readings: np.ndarray) -> float:
     """98th percentile of the magnitudes of a channel's finite readings, 0 if it has none."""
-    sizes = np.abs(shown[np.isfinite(shown)])
+    sizes = np.abs(readings[np.isfinite(readings)])
     return float(np.quantile(sizes, 0.98)) if len(sizes) else 0.0
 
 
@@ -613,10 +616,10 @@ def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tup
     counts = np.array([max(high - low, 1) for low, high in earlier])
     is_steady = np.full(len(earlier), True)
     for s in signals:
-        means = np.array([_plain(s.shown[rows[low:high]]) for low, high in earlier])
+        means = np.array([_finite_mean(s.shown[rows[low:high]]) for low, high in earlier])
         tail = s.shown[rows[tail_row:]]
         tail = tail[np.isfinite(tail)]
-        mean, noise = _plain(tail), 0.0
+        mean, noise = _finite_mean(tail), 0.0
         if len(tail) > 2:
             noise = float(np.std(tail) * math.sqrt(_correlation_time(tail - mean)))
         scatter = noise * np.sqrt(1 / counts + 1 / (len(rows) - tail_row))
@@ -624,7 +627,7 @@ def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tup
     return int(np.flatnonzero(~is_steady).max(initial=-1)) + 1
 
 
-def _plain(x: np.ndarray) -> float:
+def _finite_mean(x: np.ndarray) -> float:
     finite = x[np.isfinite(x)]
     return float(np.mean(finite)) if len(finite) else math.nan
 
@@ -672,13 +675,13 @@ def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[f
     return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), change
 
 
-def _scatter_of(
+def _scatter_of_repeats(
     runs: Runs, stretches: tuple[Stretch, ...], signals: tuple[Signal, ...], largest: float
 ) -> dict[str, float]:
     """Extra sd of each channel between stretches under the same conditions [unit], 0 with too few repeats."""
     groups: list[tuple[tuple[object, ...], list[Stretch]]] = []
     for point, s in sorted(
-        ((_point_of(runs, s), s) for s in stretches if not s.why), key=lambda pair: (pair[0], pair[1].imposed)
+        ((_operating_point(runs, s), s) for s in stretches if not s.why), key=lambda pair: (pair[0], pair[1].imposed)
     ):
         if groups and groups[-1][0] == point and s.imposed - groups[-1][1][0].imposed <= 0.2 * FINE * largest:
             groups[-1][1].append(s)
@@ -686,30 +689,30 @@ def _scatter_of(
             groups.append((point, [s]))
     scatter = {}
     for name in (s.channel.name for s in signals):
-        excess, freedom = 0.0, 0
+        excess, degrees_of_freedom = 0.0, 0
         for _, group in groups:
             values = np.array([s.mean[name] for s in group if math.isfinite(s.mean[name])])
             sds = np.array([s.sd[name] for s in group if math.isfinite(s.mean[name])])
             if len(values) > 1:
                 excess += float(np.sum((values - values.mean()) ** 2) - (1 - 1 / len(values)) * np.sum(sds**2))
-                freedom += len(values) - 1
-        scatter[name] = math.sqrt(max(excess, 0.0) / freedom) if freedom >= 3 else 0.0
+                degrees_of_freedom += len(values) - 1
+        scatter[name] = math.sqrt(max(excess, 0.0) / degrees_of_freedom) if degrees_of_freedom >= 3 else 0.0
     return scatter
 
 
-def _sign_doubt(found: Settled) -> str:
+def _sign_doubt(settled: Settled) -> str:
     """Message on speeds and currents that have the same sign in both directions of travel. Empty: there are none."""
-    layout, runs = found.runs.layout, found.runs
-    for signal in (s for s in found.signals if runs.turns_round(s.channel)):
+    layout, runs = settled.runs.layout, settled.runs
+    for signal in (s for s in settled.signals if runs.turns_round(s.channel)):
         channel = signal.channel
         name = channel.name
-        clear = [s for s in found.kept if abs(s.mean[name]) > max(SIGNED * s.sd[name], STILL * signal.largest)]
-        backward, forward = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
+        clear = [s for s in settled.kept if abs(s.mean[name]) > max(SIGNED * s.sd[name], STILL * signal.largest)]
+        backward, forward = ([s for s in clear if sign * s.imposed > 0] for sign in (-1, 1))
         wrong = [s for s in forward if s.mean[name] < 0]
         is_reversed = bool(wrong) and len(wrong) == len(forward)
         if backward and all(s.mean[name] > 0 for s in backward) and not is_reversed:
             return (
-                f"{_place_text(found, backward[0], channel)}; expected readings with their signs, negative in "
+                f"{_place_text(settled, backward[0], channel)}; expected readings with their signs, negative in "
                 f"reverse; or set [instruments.{name}] signed = false in the rig's file, if it shows only "
                 "the magnitude"
             )
@@ -719,11 +722,11 @@ def _sign_doubt(found: Settled) -> str:
                 if is_reversed
                 else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
             )
-            return f"{_place_text(found, wrong[0], channel)}; expected the sign of the imposed quantity; {cure}"
+            return f"{_place_text(settled, wrong[0], channel)}; expected the sign of the imposed quantity; {cure}"
     return ""
 
 
-def _point_of(runs: Runs, stretch: Stretch) -> tuple[object, ...]:
+def _operating_point(runs: Runs, stretch: Stretch) -> tuple[object, ...]:
     """Levels of the brake torque in a stretch, and of each side's drive in a turn, in steps of `DRIFT` of the
     largest, and its other conditions.
     """
@@ -738,28 +741,28 @@ def _point_of(runs: Runs, stretch: Stretch) -> tuple[object, ...]:
 SIGNED = 5.0
 
 
-def _place_text(found: Settled, s: Stretch, channel: Channel) -> str:
+def _place_text(settled: Settled, stretch: Stretch, channel: Channel) -> str:
     """Place of a stretch, a channel's reading there, and the imposed value, for a message."""
-    reading, unit = _digits(s.mean[channel.name], 4), found.runs.layout.imposed_column.rpartition("_")[2]
+    reading, unit = _rounded(stretch.mean[channel.name], 4), settled.runs.layout.imposed_column.rpartition("_")[2]
     return (
-        f"{found.runs.place(s.rows[0], s.rows[-1])}, {channel.column}: shows {reading:g} "
-        f"{channel.unit} at {_digits(s.imposed, 4):g} {unit}"
+        f"{settled.runs.place(stretch.rows[0], stretch.rows[-1])}, {channel.column}: shows {reading:g} "
+        f"{channel.unit} at {_rounded(stretch.imposed, 4):g} {unit}"
     )
 
 
-def _nothing_settled_message(log: Settled) -> str:
+def _nothing_settled_message(settled: Settled) -> str:
     """Message on a log without settled stretches: the reason that omits most of its time, and advice."""
-    by_reason = {why: [s for s in log.stretches if s.why == why] for why in REASONS}
+    by_reason = {why: [s for s in settled.stretches if s.why == why] for why in REASONS}
     why = max(by_reason, key=lambda why: sum(s.lasts for s in by_reason[why]))
     longest = max(by_reason[why], key=lambda s: s.lasts)
     advice = REASONS[why][1]
     cure = "log driven motion" if advice.startswith("nothing") else advice
-    instead = "give one command for straight travel" if log.runs.turns else "use the log itself with loop"
-    place = log.runs.place(longest.rows[0], longest.rows[-1])
+    alternative = "give one command for straight travel" if settled.runs.turns else "use the log itself with loop"
+    place = settled.runs.place(longest.rows[0], longest.rows[-1])
     return (
         f"{place}: no settled segment: {longest.reason}. This level has {longest.lasts:.3g} s and "
-        f"{count_noun(len(longest.rows), 'sample')}; expected at least {log.shortest:.3g} s and {FEWEST} samples; "
-        f"{cure}, or {instead}"
+        f"{count_noun(len(longest.rows), 'sample')}; expected at least {settled.shortest:.3g} s and {FEWEST} "
+        f"samples; {cure}, or {alternative}"
     )
 
 
@@ -768,27 +771,27 @@ def _nothing_settled_message(log: Settled) -> str:
 
 def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     """Current that acceleration takes in each configuration, if known."""
-    constant, inertias = float(robot.motor.torque_constant), {}
-    zero, one = jnp.zeros(()), jnp.ones(())
+    constant = float(robot.motor.torque_constant)
+    inertias = {}
+    zeros, one = jnp.zeros(()), jnp.ones(())
     for k, (name, load) in enumerate(robot.configurations.items()):
-        at_motor, rolling = (
-            inertia_at_motor(robot, load),
-            jnp.asarray(float(load.radius) / float(robot.gearbox.ratio)),
-        )
-        currents = _settled_readings(robot, k, State(one, zero, zero, zero))
-        speeds = _settled_readings(robot, k, State(zero, one, rolling, zero))
+        inertia = inertia_at_motor(robot, load)
+        rolling_speed = jnp.asarray(float(load.radius) / float(robot.gearbox.ratio))
+        currents = _settled_readings(robot, k, State(one, zeros, zeros, zeros))
+        speeds = _settled_readings(robot, k, State(zeros, one, rolling_speed, zeros))
         current = next((n for n, x in currents.items() if x and not speeds[n]), "")
         speed = next((n for n, x in speeds.items() if x), "")
         is_known = current or robot.rig.imposed == "motor_current"
-        if is_known and speed and at_motor > 0 and constant > 0:
-            per_rate = at_motor / constant * currents.get(current, 1.0) / speeds[speed]
+        if is_known and speed and inertia > 0 and constant > 0:
+            per_rate = inertia / constant * currents.get(current, 1.0) / speeds[speed]
             inertias[name] = speed, current, per_rate, 1e-3
     return inertias
 
 
 def _settled_readings(robot: Robot, configuration: int, state: State) -> dict[str, float]:
     """Readings of the settled channels in a state [unit of the column]. 0 for channels that depend on more."""
-    signals, readings = balances.begin_signals(robot, Conditions(configuration), state), {}
+    signals = balances.begin_signals(robot, Conditions(configuration), state)
+    readings = {}
     for channel in settled_channels(robot):
         try:
             readings[channel.name] = float(channel.read(robot, signals)) / channel.factor

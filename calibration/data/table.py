@@ -116,9 +116,9 @@ class Runs:
         """Voltage of left and right side [V] (on a battery, duty), or their speed [rpm], shape (2, rows). Negative in
         reverse. For a table with `turns`.
         """
-        columns, alike = self.columns, np.ones(len(self))
-        side_drives = np.stack([columns.get(name, columns.get("duty", alike)) for name in self.layout.sides])
-        supply = columns.get(SUPPLY, alike) if self.layout.imposed == "voltage" else alike
+        columns, ones = self.columns, np.ones(len(self))
+        side_drives = np.stack([columns.get(name, columns.get("duty", ones)) for name in self.layout.sides])
+        supply = columns.get(SUPPLY, ones) if self.layout.imposed == "voltage" else ones
         return side_drives * np.where(np.isnan(supply), 1.0, supply)
 
     @property
@@ -150,14 +150,14 @@ class Runs:
         """
         if self.channels == robot.channels:
             return self
-        own_columns = {column for c in robot.channels for column in (c.column, c.sd_column)}
-        if lost_columns := [column for column in self.unknown if column in own_columns]:
+        robot_columns = {column for c in robot.channels for column in (c.column, c.sd_column)}
+        if lost_columns := [column for column in self.unknown if column in robot_columns]:
             raise BadData(
                 f"{self.source}, {lost_columns[0]}: the table was read without this channel; read it with "
                 "robot=, set to this robot"
             )
-        own_columns |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
-        other_columns = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - own_columns
+        robot_columns |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
+        other_columns = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - robot_columns
         remaining_columns = {name: values for name, values in self.columns.items() if name in other_columns}
         return replace(
             self.without_columns(remaining_columns),
@@ -186,13 +186,13 @@ class Runs:
 
         This is true for speeds, and for currents if nothing else drives the motors. A bridge that reverses the
         voltage also reverses the supply current. In a turn each side has its own sign, and the yaw rate has the sign
-        of their difference (`sides.check_turns`).
+        of their difference (`contradictions.check_turns`).
         """
         is_signed = channel.directed and channel.name != "motor_voltage" and not self.layout.magnitude(channel.name)
         if self.turns or not is_signed:
             return False
-        back = self.has("duty") and channel.name == "total_current"
-        return channel.zero_at_rest or not (self.pulled or back)
+        is_reversed = self.has("duty") and channel.name == "total_current"
+        return channel.zero_at_rest or not (self.pulled or is_reversed)
 
     @property
     def sampled(self) -> bool:
@@ -262,8 +262,8 @@ class Runs:
         if not self.has("surface"):
             return configurations
         pairs = list(zip(configurations.tolist(), self["surface"].tolist(), strict=True))
-        on = {pair: configuration_on_surface(*pair) for pair in set(pairs)}
-        return np.array([on[p] if on[p] in robot.configurations else p[0] for p in pairs])
+        name_on_surface = {pair: configuration_on_surface(*pair) for pair in set(pairs)}
+        return np.array([name_on_surface[p] if name_on_surface[p] in robot.configurations else p[0] for p in pairs])
 
     def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
         """Conditions as one batch of shape (rows,).
@@ -290,18 +290,18 @@ class Runs:
             adhesion[scaled] = [adhesion_ratio(*pair) for pair in pairs]
             lateral[scaled] = [lateral_ratio(*pair) for pair in pairs]
         column, factor = IMPOSED[robot.rig.imposed]
-        imposed = robot.rig.imposed != "voltage"
-        if imposed and not self.has(column):
+        imposes_other = robot.rig.imposed != "voltage"
+        if imposes_other and not self.has(column):
             raise BadData(f"{self.source}: no {column}, the imposed quantity of the robot's file; add it")
         set_values = {
             c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)
         }
         set_values["duty"] = np.where(modes == DRIVEN[0], set_values.get("duty", 1.0), 0.0)
-        sets_motor_speed = imposed and not robot.rig.follows_goal
+        sets_motor_speed = imposes_other and not robot.rig.follows_goal
         set_values["voltage"] = np.zeros(len(self)) if battery or sets_motor_speed else self[SUPPLY]
         if robot.rig.follows_goal:
             set_values["goal"] = self[column] * factor
-        elif imposed:
+        elif imposes_other:
             set_values[robot.rig.imposed] = self[column] * factor
             for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
                 if self.has(name):

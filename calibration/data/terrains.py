@@ -44,21 +44,22 @@ def parse_stairs(text: str) -> tuple[float, float, int]:
     return rise / 1000, tread / 1000, int(count)
 
 
-def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Columns, Rows[str]]:
+def _read_columns(path: Path, option: str, headers: Rows[Rows[str]]) -> tuple[Columns, Rows[str]]:
     """Columns of a file, which must have one of several headers."""
     if not path.exists():
         raise BadConfiguration(f"{option}: got {path}, no such file")
     table = reading.read_whole_table(path)
     header = table.header
-    names = next((names for names in wanted if set(names) <= set(header)), None)
+    names = next((names for names in headers if set(names) <= set(header)), None)
     if names is None:
-        either = ", or ".join(" and ".join(names) for names in wanted)
+        either = ", or ".join(" and ".join(names) for names in headers)
         raise BadData(f"{path.name}: got columns {', '.join(header) or 'none'}; expected {either}")
-    for other_names in wanted:
+    for other_names in headers:
         if conflicting := [name for name in other_names if name in header and name not in names]:
-            ours = ", ".join(name for name in names if name not in other_names)
+            kept_names = ", ".join(name for name in names if name not in other_names)
             raise BadData(
-                f"{path.name}: got columns {', '.join(conflicting)} and {ours}; expected one kind, remove the other"
+                f"{path.name}: got columns {', '.join(conflicting)} and {kept_names}; expected one kind, "
+                "remove the other"
             )
     if not len(table):
         raise BadData(f"{path.name}: has no rows; expected at least one")
@@ -117,24 +118,24 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Leve
             or a voltage is beyond `HIGHEST`.
     """
     column_sets = [(x, f"front_{unit}", f"rear_{unit}") for unit in ("deg", "V") for x in ("x_mm", "time_s")]
-    columns, (abscissa, *both) = _read_columns(path, "--sequence", column_sets)
+    columns, (abscissa, *lever_columns) = _read_columns(path, "--sequence", column_sets)
     knots = columns[abscissa]
-    over_time, has_volts = abscissa == "time_s", both[0] == "front_V"
+    over_time, has_volts = abscissa == "time_s", lever_columns[0] == "front_V"
     falls, before = np.diff(knots, prepend=-np.inf) <= 0, np.roll(knots, 1)
     checks: list[Check] = [(abscissa, falls, lambda row: f" after {before[row]:g}; expected increasing values")]
     if has_volts:
         allowed = f" V; expected -{HIGHEST:g} to {HIGHEST:g} V"
-        checks += [(name, np.abs(columns[name]) > HIGHEST, allowed) for name in both]
+        checks += [(name, np.abs(columns[name]) > HIGHEST, allowed) for name in lever_columns]
     check_rows(path.name, columns, checks)
     x = jnp.asarray(knots if over_time else 1e-3 * knots)
     if has_volts:
-        front, rear = (jnp.asarray(columns[name]) for name in both)
+        front, rear = (jnp.asarray(columns[name]) for name in lever_columns)
         return LeverSequence(x, front, rear, jnp.asarray(begins), over_time)
-    for name in both:
+    for name in lever_columns:
         for k, value in enumerate(columns[name], 1):
             if why := lever_angle_refusal(robot, value):
                 raise BadData(f"{path.name} row {k}, {name}: {why}")
-    front, rear = (jnp.asarray(np.radians(columns[name])) for name in both)
+    front, rear = (jnp.asarray(np.radians(columns[name])) for name in lever_columns)
     return LeverSequence(x, front, rear, over_time=over_time)
 
 

@@ -74,18 +74,19 @@ def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarra
     """
     from mmrjax.fidelities.simulation import simulate
 
-    conditions, load = runs.conditions(robot), np.zeros(len(runs))
-    many = float(robot.sides) if channel == "total_current" else 1.0
-    rise = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant) / many
+    conditions = runs.conditions(robot)
+    load = np.zeros(len(runs))
+    motors = float(robot.sides) if channel == "total_current" else 1.0
+    rise = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant) / motors
     for _ in range(SEARCH):
         drawn = np.asarray(simulate(robot, replace(conditions, load_torque=jnp.asarray(load))).reading[channel])
         current_error = np.where(np.isfinite(current), current - drawn, 0.0)
         load = load + rise * np.nan_to_num(current_error)
-    bad = np.flatnonzero(~(np.abs(current_error) <= ERROR * np.nanmax(np.abs(current))))
-    if bad.size:
+    bad_rows = np.flatnonzero(~(np.abs(current_error) <= ERROR * np.nanmax(np.abs(current))))
+    if bad_rows.size:
         raise BadData(
-            f"{runs.place(bad[0])}, {LOAD}: it was computed from {channel}, and the file's robot draws "
-            f"{current[bad[0]]:.4g} A without a load torque; check the numbers in the file, or remove the row"
+            f"{runs.place(bad_rows[0])}, {LOAD}: it was computed from {channel}, and the file's robot draws "
+            f"{current[bad_rows[0]]:.4g} A without a load torque; check the numbers in the file, or remove the row"
         )
     return load
 
@@ -209,13 +210,13 @@ def without_held(runs: Runs) -> Runs:
     changing = [c for c in present_channels if np.ptp(np.nan_to_num(runs[c.column])) > 0]
     for rows, channel in itertools.product(runs.rows_by_run().values(), changing):
         column, readings = channel.column, runs[channel.column][rows]
-        rest = 0.0 if channel.settled else MOVES * np.nanmax(np.abs(readings), initial=0.0)
+        at_rest = 0.0 if channel.settled else MOVES * np.nanmax(np.abs(readings), initial=0.0)
         begins = np.flatnonzero(np.r_[True, np.diff(readings) != 0])
-        lasts = np.diff(np.r_[begins, len(rows)])
-        is_long = lasts > HELD * len(rows)
-        noisy = not is_long.all() and np.mean(lasts[~is_long] == 1) > NOISY
-        for k in np.flatnonzero(is_long & (np.abs(readings[begins]) > rest)):
-            stretch = rows[begins[k] : begins[k] + lasts[k]]
+        lengths = np.diff(np.r_[begins, len(rows)])
+        is_long = lengths > HELD * len(rows)
+        noisy = not is_long.all() and np.mean(lengths[~is_long] == 1) > NOISY
+        for k in np.flatnonzero(is_long & (np.abs(readings[begins]) > at_rest)):
+            stretch = rows[begins[k] : begins[k] + lengths[k]]
             if np.ptp(drive[stretch]) <= (SLIGHTLY if noisy else HELD) * np.ptp(drive):
                 continue
             cure = "Empty these cells to use the other rows"
@@ -272,7 +273,8 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
         )
     if len(runs) <= most:
         return runs
-    apart, read = -(-len(runs) // most), np.isfinite(runs.measured())
+    apart = -(-len(runs) // most)
+    read = np.isfinite(runs.measured())
     if runs.sampled:
         ordered = list(runs.rows_by_run().values())
     else:

@@ -108,10 +108,10 @@ def to_xarray(result: Any) -> XarrayDataset:
     import xarray as xr
 
     units = {unit_in_column(q.unit): q.unit for rows in TABLE.values() for q in rows}
-    ends = {name: unit_at_end(name, units) for name in columns_of(result)}
+    unit_by_name = {name: unit_at_end(name, units) for name in columns_of(result)}
     return xr.Dataset(
         {
-            name: ("row", values, {} if (end := ends[name]) is None else {"units": units[end]})
+            name: ("row", values, {} if (unit := unit_by_name[name]) is None else {"units": units[unit]})
             for name, values in columns_of(result).items()
         }
     )
@@ -234,11 +234,11 @@ def cell_word(text: str) -> str:
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
-def entries_of(value: Any, *listed: str) -> Json:
+def entries_of(value: Any, *entries: str) -> Json:
     """Entries of an object for a list of `key` or `key=attribute.of.attribute`. Methods are called."""
-    pairs = (entry.partition("=") for entry in listed)
-    entries = {key: operator.attrgetter(attribute or key)(value) for key, _, attribute in pairs}
-    return {key: x() if inspect.ismethod(x) else x for key, x in entries.items()}
+    pairs = (entry.partition("=") for entry in entries)
+    values = {key: operator.attrgetter(attribute or key)(value) for key, _, attribute in pairs}
+    return {key: x() if inspect.ismethod(x) else x for key, x in values.items()}
 
 
 def json_value(value: Any) -> Any:

@@ -17,10 +17,12 @@ from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 
-def feedforward_statement(found: Feedforward) -> str:
-    """Each constant with ± (95 %) and unit."""
-    units = constant_units(found.unit)
-    constants_words = (f"{n} = {x:.4g} ± {1.96 * found.sds[n]:.2g} {units[n]}" for n, x in found.constants.items())
+def feedforward_statement(feedforward: Feedforward) -> str:
+    """Feedforward constants, each with ± (95 %) and unit."""
+    units = constant_units(feedforward.unit)
+    constants_words = (
+        f"{n} = {x:.4g} ± {1.96 * feedforward.sds[n]:.2g} {units[n]}" for n, x in feedforward.constants.items()
+    )
     return ", ".join(constants_words) + "."
 
 
@@ -56,11 +58,11 @@ def _error_share(channel: str, share: float) -> str:
     return f"{share:.0%} of the squared error of {channels.find_channel(channel).label}"
 
 
-def determined_combination(two: fit_notes.DependentPair) -> str:
+def determined_combination(pair: fit_notes.DependentPair) -> str:
     """Combination of two parameters that data determine: `the ratio of a and b`, `a + 0.03 · b`."""
-    if two.form != "linear":
-        return f"the {two.form} of {two.one} and {two.other}"
-    return f"{two.one} {'-' if two.weight < 0 else '+'} {abs(two.weight):.2g} · {two.other}"
+    if pair.form != "linear":
+        return f"the {pair.form} of {pair.one} and {pair.other}"
+    return f"{pair.one} {'-' if pair.weight < 0 else '+'} {abs(pair.weight):.2g} · {pair.other}"
 
 
 def is_determined_answer(held: bool, others: tuple[str, ...]) -> str:
@@ -71,7 +73,7 @@ def is_determined_answer(held: bool, others: tuple[str, ...]) -> str:
 
 
 def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
-    """Rows with a property, and its consequence."""
+    """Sentence on rows with a property, and on its consequence."""
     row_words = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
         return (
@@ -84,7 +86,7 @@ def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> st
 
 
 def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open: int) -> str:
-    """Agreement of searches from many starts."""
+    """Sentence on the agreement of searches from several starts."""
     if starts == 1:
         return "one search was made and did not converge" if open else "one search was made"
     if agree == starts:
@@ -100,7 +102,7 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
 
 
 def search_generations(members: int, generations: int, settled: bool) -> str:
-    """Progress of a search."""
+    """Sentences on the size of a search by generations, and on its end."""
     end = "The last one improved no further"
     if not settled:
         end = "The last one still improved: use more --generations"
@@ -118,7 +120,7 @@ def distance_from_prior(bound: str, sds: float) -> str:
 
 
 def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
-    """Result of the most significant test of residuals."""
+    """Result of the most significant test of residuals, in words."""
     whose = f"the residuals of {channels.find_channel(test.channel).label}" if test.channel else ""
     return {
         "": "",
@@ -139,12 +141,12 @@ OBSTACLES = {
 }
 
 
-def _misses(those: Sequence[RelativeError]) -> str:
+def _relative_errors(errors: Sequence[RelativeError]) -> str:
     """`total current 74 % of its measured rms (32 % with the file as given)`."""
     miss_words = [
         f"{channels.find_channel(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} "
         "before the fit)"
-        for m in those
+        for m in errors
     ]
     return ", ".join(miss_words)
 
@@ -153,25 +155,25 @@ def _percent(share: float) -> str:
     return f"{100 * share:.{0 if share > 0.1 else 1}f} %"
 
 
-def adequacy_verdict(found: Adequacy) -> str:
-    """Verdict on the adequacy of a fit. First line of a calibration's output."""
-    if found.obstacle:
-        large = "it misses " + _misses([m for m in found.misses if m.large])
-        return OBSTACLES[found.obstacle].format(large=large, every=_misses(found.misses))
-    chi2 = f"χ² {found.chi2:.4g} on {found.degrees_of_freedom:.4g} degrees of freedom"
-    if found.adequate is None or found.p_value is None:
+def adequacy_verdict(adequacy: Adequacy) -> str:
+    """Verdict on the adequacy of a fit."""
+    if adequacy.obstacle:
+        large = "it misses " + _relative_errors([m for m in adequacy.misses if m.large])
+        return OBSTACLES[adequacy.obstacle].format(large=large, every=_relative_errors(adequacy.misses))
+    chi2 = f"χ² {adequacy.chi2:.4g} on {adequacy.degrees_of_freedom:.4g} degrees of freedom"
+    if adequacy.adequate is None or adequacy.p_value is None:
         return (
             "Adequacy cannot be tested: noise was estimated from the misfit "
-            f"({found.degrees_of_freedom:.4g} degrees of freedom). State it with --noise"
+            f"({adequacy.degrees_of_freedom:.4g} degrees of freedom). State it with --noise"
         )
-    p = f"p = {found.p_value:.2g}" if found.p_value > 1e-6 else "p < 1e-6"
-    if not found.adequate:
-        why = f"{chi2}, {p}" if found.noise_known else f"{p}, with estimated noise"
+    p = f"p = {adequacy.p_value:.2g}" if adequacy.p_value > 1e-6 else "p < 1e-6"
+    if not adequacy.adequate:
+        evidence = f"{chi2}, {p}" if adequacy.noise_known else f"{p}, with estimated noise"
         return (
-            f"Not adequate: {adequacy_finding_in_words(found.shown_by)} ({why}), so a term is missing. Run mmrjax "
-            "loop to find it"
+            f"Not adequate: {adequacy_finding_in_words(adequacy.shown_by)} ({evidence}), so a term is missing. Run "
+            "mmrjax loop to find it"
         )
-    if found.noise_known:
+    if adequacy.noise_known:
         return f"Adequate: the residuals are consistent with the stated noise ({chi2}, {p})"
     return (
         f"Adequate as far as can be tested: the residuals show no structure ({p}). The noise was estimated from them"
@@ -186,58 +188,59 @@ _VERDICTS: dict[bool | None, str] = {
 }
 
 
-def calibration_answer(found: CalibrationResult) -> str:
+def calibration_answer(fit: CalibrationResult) -> str:
     """Answer of a calibration: adequate or not, and rms errors before and after over the rows that have both."""
     channel_errors, rows = list[tuple[str, str]](), dict[str, int]()
-    for c in found.channels:
-        r = found.readings[c.name]
-        is_compared = np.isfinite(r.measured) & np.isfinite(r.before) & np.isfinite(r.after)
+    for c in fit.channels:
+        readings = fit.readings[c.name]
+        is_compared = np.isfinite(readings.measured) & np.isfinite(readings.before) & np.isfinite(readings.after)
         if is_compared.any():
-            size = root_mean_square(r.measured[is_compared])
+            size = root_mean_square(readings.measured[is_compared])
             before, after = (
-                100 * root_mean_square((x - r.measured)[is_compared]) / size for x in (r.before, r.after)
+                100 * root_mean_square((x - readings.measured)[is_compared]) / size
+                for x in (readings.before, readings.after)
             )
             rows[c.label] = int(is_compared.sum())
             channel_errors.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
     if not channel_errors:
-        return f"{_VERDICTS[found.adequacy.adequate]}. No row is predicted before and after the fit."
+        return f"{_VERDICTS[fit.adequacy.adequate]}. No row is predicted before and after the fit."
     same_rows = len(set(rows.values())) == 1
     errors = ", ".join(text + ("" if same_rows else f" ({rows[label]} rows)") for label, text in channel_errors)
     row_words = f"the same {count_noun(max(rows.values()), 'row')}" if same_rows else "the same rows"
-    return f"{_VERDICTS[found.adequacy.adequate]}. The rms error before → after on {row_words}: {errors}."
+    return f"{_VERDICTS[fit.adequacy.adequate]}. The rms error before → after on {row_words}: {errors}."
 
 
-#: Fitted parameters that a terminal shows, and remarks that it shows in full.
+#: Number of fitted parameters on a terminal, and codes of the remarks that it shows in full.
 FEW, TO_CHECK = 4, ("unsettled", "far_from_prior", "after_steps", "shifted", "freed_delay", "residual_cluster")
 
 
-def brief_calibration(found: CalibrationResult) -> Names:
+def brief_calibration(fit: CalibrationResult) -> Names:
     """Lines printed below the answer: adequacy, determined parameters, hold-out errors, and what to check."""
-    determined = {name: p for name, p in found.parameters.items() if not p.held_by_prior}
+    determined = {name: p for name, p in fit.parameters.items() if not p.held_by_prior}
     first = sorted(determined.items(), key=lambda item: -abs(item[1].shift))[:FEW]
     fitted = [f"{name} {p.value:.3g} ± {p.sd:.2g} {p.unit}".rstrip(" -") + f" ({p.shift:+.1f})" for name, p in first]
     others_text = f", and {len(determined) - FEW} more" * (len(determined) > FEW)
     parameters = (
-        f"These runs determine {len(determined)} of {len(found.parameters)} parameters (shift in prior sds): "
+        f"These runs determine {len(determined)} of {len(fit.parameters)} parameters (shift in prior sds): "
         f"{', '.join(fitted) or 'none'}{others_text}."
     )
     held_out = []
-    for kind in list(found.held_out_alike)[:1]:
-        errors = found.held_out[kind].errors
-        percent = [f"{c.label} {errors[c.name].rms_percent:.1f} %" for c in found.channels if errors[c.name].rows]
+    for kind in list(fit.held_out_alike)[:1]:
+        errors = fit.held_out[kind].errors
+        percent = [f"{c.label} {errors[c.name].rms_percent:.1f} %" for c in fit.channels if errors[c.name].rows]
         held_out = [f"rms error with each {blocks.kind_in_words(kind)} left out of the fit: {', '.join(percent)}."]
-    to_check = sentences(fit_notes.remarks_with_codes(found.remarks, *TO_CHECK))
+    to_check = sentences(fit_notes.remarks_with_codes(fit.remarks, *TO_CHECK))
     check = f"Check first: {as_paragraph(to_check)} " * bool(to_check)
-    others = count_noun(len(found.notes) - len(to_check), "further remark")
-    return f"{found.adequacy.statement}.", parameters, *held_out, f"{check}--verbose prints tables and {others}."
+    others = count_noun(len(fit.notes) - len(to_check), "further remark")
+    return f"{fit.adequacy.statement}.", parameters, *held_out, f"{check}--verbose prints tables and {others}."
 
 
-#: Levels of a cluster that are listed, the farthest from nothing.
+#: Number of levels of a cluster that are listed, those with the largest means.
 LISTED = 6
 
 
 def residual_cluster(c: ResidualCluster) -> str:
-    """Residuals that depend on a column that the model does not use."""
+    """Sentences on residuals that depend on a column that the model does not use."""
     subject = f"residuals of {channels.find_channel(c.channel).label}"
     range_ = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in both directions" if c.reversing else ""

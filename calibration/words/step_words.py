@@ -44,7 +44,7 @@ STEPS = {
 }
 
 
-#: Stage of the loop that a step belongs to, from 1 on, and how many there are.
+#: Stage of the loop to which each step belongs, counted from 1, and number of stages.
 STAGES = {
     **{"base": 1, "sds": 1, "bootstrap": 2, "effects": 3, "more effects": 3, "alone": 3},
     **{
@@ -60,12 +60,13 @@ STAGES = {
     },
 }
 OF = max(STAGES.values())
-#: Share of a loop's time that is over when a stage begins: of logs with nothing kept, a guess for others.
+#: Share of a loop's time that has passed when a stage begins. Measured for logs without stored results, a guess for
+#: others.
 OVER = {2: 0.45, 3: 0.5, 4: 0.7, 5: 0.75, 6: 0.8, 7: 0.9}
 
 
 def step_sentence(name: str, about: tuple[object, ...]) -> str:
-    """A step in a sentence, a stage of the loop with its number."""
+    """Progress message on a step, with the number of its stage of the loop."""
     text = STEPS[name].format(*(" and ".join(x) if isinstance(x, tuple) else x for x in about))
     return f"{STAGES[name]} of {OF}, {text}" if name in STAGES else text
 
@@ -83,6 +84,6 @@ def expected_time(text: str, seconds: float) -> float | None:
 
 
 def still_running_sentence(doing: str, seconds: float, compiled: int) -> str:
-    """Progress of a running step: its duration and the number of programs compiled."""
+    """Message on a step that is still running: its duration and the number of compiled programs."""
     programs = f", {count_noun(compiled, 'program')} compiled" if compiled else ""
     return f"still {doing} ({seconds:.0f} s{programs})"

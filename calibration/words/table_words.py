@@ -33,7 +33,7 @@ ALIKE = {
 
 
 def would_measure(name: str) -> str:
-    """Runs or instrument that would measure a parameter that these data do not."""
+    """Runs or an instrument that would measure a parameter that these data do not."""
     for key, meaning in WOULD_MEASURE.items():
         if name.startswith(key) or name.endswith(key):
             return meaning
@@ -50,16 +50,16 @@ def differing_repeats(
     more: int = 0,
     near: str = "",
 ) -> str:
-    """Rows under the same conditions whose readings differ."""
+    """Sentence on two rows whose readings differ under the same conditions."""
     (first, second), (one, other) = rows, values
-    reading = (
+    finding = (
         f"{source} rows {first} and {second}, {column}: the same conditions gave {one:g} and {other:g}, {apart} "
         f"apart{f' (and {more} more such pairs)' * bool(more)}"
     )
     if unused:
-        name = f'set [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
-        return f"{reading}. {_unused(unused)}. So {name}, or give each level of a load a configuration"
-    wrong = f"{reading}. Remove the wrong row"
+        advice = f'set [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
+        return f"{finding}. {_unused(unused)}. So {advice}, or give each level of a load a configuration"
+    wrong = f"{finding}. Remove the wrong row"
     return f"{wrong}, or find what changed between them" if more else wrong
 
 
@@ -69,23 +69,23 @@ def _unused(names: Sequence[str]) -> str:
 
 
 def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
-    """Columns that vary and have no role, and what each may be."""
-    sentences_unused = [f"{source}: {_unused([name for name, _ in columns])}"]
+    """Sentences on columns that vary and are not used, and on the quantity that each may be."""
+    sentences = [f"{source}: {_unused([name for name, _ in columns])}"]
     for name, near in columns:
         if near:
-            sentences_unused.append(f'If {name} is {near}, set [columns] {near} = "{name}" in the robot\'s file')
-    return ". ".join(sentences_unused)
+            sentences.append(f'If {name} is {near}, set [columns] {near} = "{name}" in the robot\'s file')
+    return ". ".join(sentences)
 
 
 def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> str:
-    """Runs of one condition."""
-    name = f"{_unused(unused)}. Name conditions under [columns], or "
+    """Sentence on runs that differ only by noise, and advice."""
+    advice = f"{_unused(unused)}. Name conditions under [columns], or "
     record = f"{'r' if unused else 'R'}ecord runs at several values of {column} or at several loads"
-    return f"{source}: these {rows} runs differ only by noise. {name * bool(unused)}{record}"
+    return f"{source}: these {rows} runs differ only by noise. {advice * bool(unused)}{record}"
 
 
 def copied_channel(source: str, column: str, other: str, intercept: float, slope: float, tied: bool) -> str:
-    """A channel that is a line of another."""
+    """Sentence on a channel that is a linear function of another channel."""
     start = f"{intercept:.4g} {'+' if slope >= 0 else '-'} " if intercept else ""
     factor = abs(slope) if intercept else slope
     sentence = f"{source}, {column}: equals {start}{factor:.4g} times {other} in every row, to the last digit"
@@ -99,8 +99,8 @@ def _runs(names: Names, one: str, several: str) -> str:
 
 
 def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: Names) -> str:
-    """A part that is not the nominal robot's while friction of it is."""
-    changes = ", ".join(f"{name} {own_value:g} instead of {nominal:g}" for name, own_value, nominal in changed)
+    """Sentence on a part with changed values that keeps the nominal robot's priors of friction."""
+    changes = ", ".join(f"{name} {value:g} instead of {nominal:g}" for name, value, nominal in changed)
     return (
         f"the {part} differs from the nominal robot's ({changes}), but {', '.join(kept)} still "
         f"{'has' if len(kept) == 1 else 'have'} the nominal robot's prior. Set yours with --prior"
@@ -110,13 +110,13 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
 def sentence_on_implausible_readings(
     column: str, unit: str, factor: float, units: Names, others: Names, imposed: str
 ) -> str:
-    """Readings that no robot like this one shows."""
+    """Sentence on readings that no similar robot gives."""
     ratio, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     subject = f"{column}: about {float(f'{ratio:.2g}'):g} times too {size} for this robot"
-    alike = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
+    shared = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
     if units:
-        return f"{subject}; are they in {' or '.join(units)}? expected {unit}{alike}"
-    return f"{subject}{alike}" if others else f"{subject}; check the unit, {unit}, {imposed} and the robot's file"
+        return f"{subject}; are they in {' or '.join(units)}? expected {unit}{shared}"
+    return f"{subject}{shared}" if others else f"{subject}; check the unit, {unit}, {imposed} and the robot's file"
 
 
 #: Reasons for fitting the settled runs of a log.
@@ -202,71 +202,73 @@ OF_LEVELS = ("changes", "short", "settling", "accelerates")
 
 
 def omitted_stretches(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str, int, int, str, str]]:
-    """Reasons, each with its stretches, samples, rows of the longest one, and what to do.
+    """For each reason: its words, its numbers of stretches and samples, rows of the longest stretch, and advice.
 
     Args:
         few: the log itself is to be fitted, as it has too few settled runs.
     """
-    causes = []
+    rows = []
     omitted = [s for s in stretches if s.why]
     for why in dict.fromkeys(s.why for s in omitted):
         stretches_of_reason = [s for s in omitted if s.why == why]
         longest = max(stretches_of_reason, key=lambda s: len(s.rows))
-        rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
+        row_range = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
         cure = "nothing, a fit to the log uses them" if few and why in OF_LEVELS else REASONS[why][1]
-        causes.append(
+        rows.append(
             (
                 longest.reason,
                 len(stretches_of_reason),
                 sum(len(s.rows) for s in stretches_of_reason),
-                rows,
+                row_range,
                 cure,
             )
         )
-    return causes
+    return rows
 
 
-def settle_statement(found: Settled) -> str:
-    """Number of settled runs of a log, and its samples."""
-    stretches, rows = found.kept, sum(len(s.rows) for s in found.kept)
+def settle_statement(settled: Settled) -> str:
+    """Sentence on the number of settled runs of a log and of their samples."""
+    stretches, rows = settled.kept, sum(len(s.rows) for s in settled.kept)
     backward_count = sum(s.imposed < 0 for s in stretches)
-    ways = f", {len(stretches) - backward_count} forward and {backward_count} backward" if backward_count else ""
+    directions = (
+        f", {len(stretches) - backward_count} forward and {backward_count} backward" if backward_count else ""
+    )
     return (
-        f"{count_noun(len(stretches), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples (each at least "
-        f"{found.shortest:.3g} s long, with means steady to {100 * found.drift:g} %)."
+        f"{count_noun(len(stretches), 'settled run')}{directions}, from {rows} of {len(settled.runs)} samples (each "
+        f"at least {settled.shortest:.3g} s long, with means steady to {100 * settled.drift:g} %)."
     )
 
 
-def levels_and_samples(found: Settled) -> str:
-    """Division of samples into levels, and the samples of a level that are used."""
+def levels_and_samples(settled: Settled) -> str:
+    """Sentences on the division of a log into levels, and on the samples of a level that count."""
     return (
-        f"Neighbouring samples are one level if the imposed quantity differs by less than {50 * found.drift:g} % "
-        f"or its noise. A level counts once every channel stays within {100 * found.drift:g} % of its last value, "
+        f"Neighbouring samples are one level if the imposed quantity differs by less than {50 * settled.drift:g} % "
+        f"or its noise. A level counts once every channel stays within {100 * settled.drift:g} % of its last value, "
         "or its noise."
     )
 
 
-def sentence_on_few_settled_runs(found: Settled, fewest: int, loop: str) -> str:
-    """Sentence for a log with too few settled runs: fit the log itself, empty where it has enough.
+def sentence_on_few_settled_runs(settled: Settled, fewest: int, loop: str) -> str:
+    """Advice for a log with too few settled runs, empty if it has enough.
 
     Args:
-        fewest: rows that the loop asks for.
+        fewest: number of settled runs that the loop needs.
         loop: command that fits the log as it is.
     """
-    if len(found.kept) >= fewest:
+    if len(settled.kept) >= fewest:
         return ""
-    if found.runs.turns:  # over time a turn is simulated, and not fitted
+    if settled.runs.turns:  # over time a turn is simulated, and not fitted
         return f"The loop needs {fewest} settled runs: hold more levels, or each longer."
     return f"The loop needs {fewest} settled runs, so run it on the log: {loop}."
 
 
-def settle_remarks(found: Settled) -> list[str]:
-    """Sentences on what should be looked at."""
+def settle_remarks(settled: Settled) -> list[str]:
+    """Sentences on points to check, one each."""
     remarks = []
-    if found.gaps:
-        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}")
-    for channel in (s.channel for s in found.signals):
-        glitch_stretches = [s for s in found.kept if channel.name in s.glitches]
+    if settled.gaps:
+        remarks.append(f"samples are missing after {rows_text(settled.gaps, 5)}")
+    for channel in (s.channel for s in settled.signals):
+        glitch_stretches = [s for s in settled.kept if channel.name in s.glitches]
         if glitch_stretches:
             counts = [s.glitches[channel.name] for s in glitch_stretches]
             worst = glitch_stretches[counts.index(max(counts))]
@@ -277,16 +279,16 @@ def settle_remarks(found: Settled) -> list[str]:
                 f"({100 * max(counts) / len(worst.rows):.2g} %). Check the instrument, or log a mean of pulses"
             )
     angles = {rate: angle for angle, rate, _ in RATES}
-    for channel in (s.channel for s in found.signals):
-        if channel not in found.runs.channels:
+    for channel in (s.channel for s in settled.signals):
+        if channel not in settled.runs.channels:
             remarks.append(
                 f"{channel.column} is the rate of {angles[channel.name]}. To get it, add {channel.name} to the "
                 "rig's channels"
             )
-    wide = {name: x for name, x in found.scatter.items() if x > 0}
-    for signal in (s for s in found.signals if s.channel.name in wide):
+    scatter = {name: x for name, x in settled.scatter.items() if x > 0}
+    for signal in (s for s in settled.signals if s.channel.name in scatter):
         remarks.append(
-            f"{signal.channel.column}: repeated levels differ by {wide[signal.channel.name]:.2g} "
+            f"{signal.channel.column}: repeated levels differ by {scatter[signal.channel.name]:.2g} "
             f"{signal.channel.unit} beyond their noise, which the sds include"
         )
     return remarks

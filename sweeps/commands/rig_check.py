@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Json, Names, rig_facts, settling
+from calibration.data import Json, Names, rig_facts, settling, stated
 from calibration.data.columns import IMPOSED, SUPPLY, Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import DerivedFact, NumberOrigin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
-from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, has_template_number, is_example
 from calibration.described import as_paragraph, describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import determination
@@ -74,11 +73,11 @@ class RigCheck:
         robot, rig = self.robot, self.robot.rig
         count = int(robot.sides)
         motors = "One motor drives" if count == 1 else f"{count} motors with the same command drive"
-        gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
+        gear_words = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
         names: dict[str, list[str]] = {}
         for name, load in robot.configurations.items():
             names.setdefault(_load_words(load), []).append(name)
-        loads = "; ".join(f"{_few(one)}: {load}" for load, one in names.items())
+        loads = "; ".join(f"{_few(alike)}: {load}" for load, alike in names.items())
         imposed = {
             "voltage": "the voltage (times the duty in histories)",
             "motor_speed": "the motors' speed",
@@ -90,12 +89,12 @@ class RigCheck:
             "measured": "start from the state in their first samples",
             "free": "start from a fitted state",
         }
-        late = f", with a delay of {float(rig.delay):g} s" * bool(rig.delay)
-        lines = ", interpolated between the rows of time histories" * (rig.between_rows == "linear")
-        coasts = "; between the pulses of a duty the motors coast" * (self.robot.driver.decay == FAST)
+        delay_words = f", with a delay of {float(rig.delay):g} s" * bool(rig.delay)
+        row_words = ", interpolated between the rows of time histories" * (rig.between_rows == "linear")
+        decay_words = "; between the pulses of a duty the motors coast" * (self.robot.driver.decay == FAST)
         return [
-            f"{motors}, through {gear}, {loads}.",
-            f"Imposed: {imposed}{late}{lines}{coasts}. Time histories {starts[rig.start]}.",
+            f"{motors}, through {gear_words}, {loads}.",
+            f"Imposed: {imposed}{delay_words}{row_words}{decay_words}. Time histories {starts[rig.start]}.",
         ]
 
     def remarks(self) -> list[str]:
@@ -103,7 +102,7 @@ class RigCheck:
         notes = []
         if self.robot.rig.inherits:
             notes.append('missing values come from the base, a packaged robot. base = "none" prevents this')
-        widened = f"({EXAMPLE}): {{}}. a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
+        widened = f"({stated.EXAMPLE}): {{}}. a fit widens each ± among them to {100 * stated.EXAMPLE_SHARE:g} %"
         for lines, text in (
             (self.examples, f"example number {widened}"), (self.unmarked, "example: {}. Check that it is yours"),
         ):  # fmt: skip
@@ -114,10 +113,10 @@ class RigCheck:
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append("with a duty, total_current is that of the supply. Motor leads carry motor_current")
         notes += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
-        loose = [o for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value]
-        if loose and not self.robot.rig.inherits:
-            sds = priors.parameter_coordinates(self.robot, [o.name for o in loose]).prior_sd
-            shares = [f"{o.name} (±{100 * sd / abs(o.value):.2g} %)" for o, sd in zip(loose, sds, strict=True)]
+        without_sd = [o for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value]
+        if without_sd and not self.robot.rig.inherits:
+            sds = priors.parameter_coordinates(self.robot, [o.name for o in without_sd]).prior_sd
+            shares = [f"{o.name} (±{100 * sd / abs(o.value):.2g} %)" for o, sd in zip(without_sd, sds, strict=True)]
             notes.append(f"no ± is given, so the default ± is used: {_few(shares)}")
         if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
             lacking = " and ".join(self.robot.unknown(HEAT))
@@ -165,18 +164,18 @@ class RigCheck:
         for name, values in self.runs.columns.items():
             if name not in headings and name in idle:
                 continue
-            number = np.issubdtype(values.dtype, np.number)
-            finite = values[np.isfinite(values)] if number else values
-            kinds = np.unique(finite)
+            is_number = np.issubdtype(values.dtype, np.number)
+            finite = values[np.isfinite(values)] if is_number else values
+            distinct = np.unique(finite)
             rows.append(
                 {
                     "column": name,
                     "theirs": headings.get(name, ""),
                     "use": uses.get(name, "condition") if name in headings else "not in the table",
-                    "values": len(kinds),
-                    "least": float(finite.min()) if number and len(finite) else None,
-                    "greatest": float(finite.max()) if number and len(finite) else None,
-                    "words": [] if number else kinds.tolist(),
+                    "values": len(distinct),
+                    "least": float(finite.min()) if is_number and len(finite) else None,
+                    "greatest": float(finite.max()) if is_number and len(finite) else None,
+                    "words": [] if is_number else distinct.tolist(),
                 }
             )
         return rows
@@ -192,8 +191,8 @@ class RigCheck:
             if name in names
         ]
         if others := [name for name in self.runs.unknown if name not in names]:
-            text = "used only to group residuals. To use one, name it under [columns]"
-            notes.append(f"{', '.join(others)}: {text}")
+            advice = "used only to group residuals. To use one, name it under [columns]"
+            notes.append(f"{', '.join(others)}: {advice}")
         return notes
 
     def statement(self) -> str:
@@ -254,8 +253,8 @@ def _few(names: Sequence[str]) -> str:
 
 def _load_words(load: Any) -> str:
     if not isinstance(load, Shaft):
-        on = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
-        return f"a vehicle of {float(load.mass):g} kg on {on}"
+        movers = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
+        return f"a vehicle of {float(load.mass):g} kg on {movers}"
     words = [f"a shaft of {float(load.inertia):.3g} kg·m²"]
     words += ["an arm under gravity"] if float(load.torque_gravity) > 0 else []
     words += ["a constant torque"] if float(load.torque_constant) != 0 else []
@@ -287,104 +286,110 @@ def check_rig_file(
 
 def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns: str | None = None) -> RigCheck:
     """Remarks on a rig's file, and on a table whose columns a preset may name."""
-    rig = load_robot(RobotPart(robot=str(file), effects=effects))
-    lines, robot = rig.text.splitlines(), rig.robot
-    examples = tuple(k for k, line in enumerate(lines, 1) if is_example(line))
-    unmarked = tuple(k for k, line in enumerate(lines, 1) if has_template_number(line) and k not in examples)
-    origins, facts = tuple(rig_facts.number_origins(rig)), tuple(rig_facts.derived_facts(robot))
-    check = RigCheck(rig.name, robot, examples, unmarked, origins, facts)
+    robot_file = load_robot(RobotPart(robot=str(file), effects=effects))
+    lines, robot = robot_file.text.splitlines(), robot_file.robot
+    examples = tuple(k for k, line in enumerate(lines, 1) if stated.is_example(line))
+    unmarked = tuple(k for k, line in enumerate(lines, 1) if stated.has_template_number(line) and k not in examples)
+    origins, facts = tuple(rig_facts.number_origins(robot_file)), tuple(rig_facts.derived_facts(robot))
+    check = RigCheck(robot_file.name, robot, examples, unmarked, origins, facts)
     if data is None:
         return check
     runs = read_runs(data, robot, columns=columns, measured=True, series=True)
-    foreseen = foresight.predict_identifiability(runs, robot)
+    forecast = foresight.predict_identifiability(runs, robot)
     doubts = (
         *filter(None, (settling.doubtful_sign(runs),)),
         *rig_facts.log_doubts(runs, robot),
-        *sentences(foreseen.doubts),
+        *sentences(forecast.doubts),
     )
-    return dataclasses.replace(check, runs=runs, foresight=foreseen, doubts=doubts)
+    return dataclasses.replace(check, runs=runs, foresight=forecast, doubts=doubts)
 
 
-def check_document(found: RigCheck) -> Document:
+def check_document(check: RigCheck) -> Document:
     """The whole check as a document."""
     signs = {None: FREE, True: "signed", False: "magnitude"}
     steps = (
         FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
-        for c in found.channels()
+        for c in check.channels()
     )
     blocks = [
         (c["channel"], c["column"], signs[c["signed"]], step, c["sd"])
-        for c, step in zip(found.channels(), steps, strict=True)
+        for c, step in zip(check.channels(), steps, strict=True)
     ]
-    sds = ("" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact" for o in found.origins)
-    numbers = [(o.name, o.value, sd, o.unit, o.why) for o, sd in zip(found.origins, sds, strict=True)]
-    follows = [(fact.what, fact.value, "LOOK" if fact.odd else "ok") for fact in found.facts]
-    table: Names = ()
-    if found.runs is not None:
+    sds = ("" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact" for o in check.origins)
+    numbers = [(o.name, o.value, sd, o.unit, o.why) for o, sd in zip(check.origins, sds, strict=True)]
+    follows = [(fact.what, fact.value, "LOOK" if fact.odd else "ok") for fact in check.facts]
+    table_words: Names = ()
+    if check.runs is not None:
         used = [
             c["theirs"] or c["column"]
-            for c in found.columns()
+            for c in check.columns()
             if c["use"] not in ("condition", "not in the table") or (c["use"] == "condition" and c["values"] > 1)
         ]
-        unused = f" Not in use: {', '.join(found.runs.unknown)}." * bool(found.runs.unknown)
-        table = (f"{count_noun(len(found.runs), 'row')}. Columns in use: {', '.join(used)}.{unused}",)
-    notes = found.remarks()
-    check = f"Check: {as_paragraph(notes[:FEW])}" if notes else "Nothing to check."
+        unused = f" Not in use: {', '.join(check.runs.unknown)}." * bool(check.runs.unknown)
+        table_words = (f"{count_noun(len(check.runs), 'row')}. Columns in use: {', '.join(used)}.{unused}",)
+    notes = check.remarks()
+    first_remarks = f"Check: {as_paragraph(notes[:FEW])}" if notes else "Nothing to check."
     further_remarks = f" and {count_noun(len(notes) - FEW, 'further remark')}" * (len(notes) > FEW)
     return Document(
-        found.file,
-        f"{found.file}: {found.statement()}",
+        check.file,
+        f"{check.file}: {check.statement()}",
         (
-            Note(" ".join(found.understood()), terminal=True),
+            Note(" ".join(check.understood()), terminal=True),
             Table("channels", columns("channel", "column", "sign", "step |", "sd"), blocks, "channels"),
             Table("numbers", columns("parameter", "value | .5g", "± |", "unit", "from"), numbers, "numbers"),
             Table("facts", columns("fact", "value |", "check"), follows, "what follows"),
-            *remarks(found.remarks()),
-            *(_data_blocks(found, found.runs, found.foresight) if found.runs and found.foresight else ()),
+            *remarks(check.remarks()),
+            *(_data_blocks(check, check.runs, check.foresight) if check.runs and check.foresight else ()),
         ),
-        brief=(" ".join(found.understood()), *table, f"{check} --verbose prints all tables{further_remarks}."),
+        brief=(
+            " ".join(check.understood()),
+            *table_words,
+            f"{first_remarks} --verbose prints all tables{further_remarks}.",
+        ),
     )
 
 
-def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:
-    channel_names = [
+def _data_blocks(check: RigCheck, runs: Runs, forecast: InformationForecast) -> tuple[Block, ...]:
+    column_rows = [
         (
             c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}",
             c["use"], c["values"], *(("", "") if c["words"] else (c["least"], c["greatest"])),
             ", ".join(c["words"]) if len(c["words"]) < 5 else f"{', '.join(c['words'][:3])}, ...",
         )
-        for c in found.columns()
+        for c in check.columns()
     ]  # fmt: skip
-    notes_of_data = found.unused()
-    if len(seen.status) < len(runs):
-        notes_of_data.insert(0, f"loop and calibrate use {len(seen.status)} of these rows (--rows)")
+    notes = check.unused()
+    if len(forecast.status) < len(runs):
+        notes.insert(0, f"loop and calibrate use {len(forecast.status)} of these rows (--rows)")
     has_clamped_rows = runs.has("held") or (
         runs.layout.imposed == "motor_speed" and not runs[runs.layout.imposed_column].any()
     )
     settled = {*words.SETTLED, *(["stalled"] if has_clamped_rows else [])}  # a held shaft is meant to stand still
     others = [
-        f"{count_noun(count, 'row')}: {name}" for name, count in Counter(seen.status).items() if name not in settled
+        f"{count_noun(count, 'row')}: {name}"
+        for name, count in Counter(forecast.status).items()
+        if name not in settled
     ]
     if others:
-        notes_of_data.append(f"some rows have no steady state with the file's numbers ({', '.join(others)})")
+        notes.append(f"some rows have no steady state with the file's numbers ({', '.join(others)})")
     determined = [
-        (p.name, p.value, p.prior_sd, p.unit, p.share, found.determined(p))
-        for p in sorted(seen.parameters, key=lambda p: p.share)
+        (p.name, p.value, p.prior_sd, p.unit, p.share, check.determined(p))
+        for p in sorted(forecast.parameters, key=lambda p: p.share)
     ]
-    heads = columns("parameter", "value | .4g", "prior ± | .2g", "unit", "posterior/prior | .2f", "determined")
+    headings = columns("parameter", "value | .4g", "prior ± | .2g", "unit", "posterior/prior | .2f", "determined")
     alike = (
         f"{one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})"
-        + f"; {' or '.join(more)} would separate them" * bool(more)
-        for (one, other, size), more in zip(seen.alike, seen.separating, strict=True)
+        + f"; {' or '.join(separating)} would separate them" * bool(separating)
+        for (one, other, size), separating in zip(forecast.alike, forecast.separating, strict=True)
     )
     return (
         Table(
-            "columns", columns("column", "used as", "values |", "from | .5g", "to | .5g", "words"), channel_names,
+            "columns", columns("column", "used as", "values |", "from | .5g", "to | .5g", "words"), column_rows,
             f"{runs.source}: {count_noun(len(runs), 'row')}",
         ),
-        *remarks(notes_of_data),
+        *remarks(notes),
         Table(
-            "determined", heads, determined,
+            "determined", headings, determined,
             "parameters that these data determine (posterior sd over prior sd)",
         ),
         Note(f"not determined: above {identifiability.HELD:g}", terminal=True),

@@ -16,8 +16,8 @@ from calibration.data.input_files import VALUE, check_memory, file_bytes, first_
 from calibration.data.named_arrays import cell_number
 from sweeps.commands.rig_numbers import (
     LEVEL,
-    Found,
     JointNumbers,
+    NumberWithSource,
     StatedNumber,
     choose_joint,
     equal_wheels,
@@ -106,12 +106,12 @@ def check_mujoco_model(source: Path) -> None:
             stack += [(child, copies) for child in element]
 
 
-def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequence[str]) -> int:
+def _check_attributes(element: Element, file: Path, folder: Path, folders: Sequence[str]) -> int:
     """Number of copies that an element makes of its content, after its numbers and files are checked.
 
     Args:
         folder: folder of the model.
-        inside: its subfolders that may contain files.
+        folders: its subfolders that may contain files.
     """
     tag, place_words, sizes = element.tag, f"{file}, <{element.tag}>", [1.0]
     for key, text in element.attrib.items():
@@ -123,13 +123,13 @@ def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequen
             raise BadConfiguration(f"{place_words} {key}: got {text}; expected at most {MOST_COPIES:,}")
         if key in SIZES.get(tag, ()):
             sizes.append(math.prod(max(x, 1.0) for x in numbers))
-        for base in inside if key.startswith("file") else ():
+        for base in folders if key.startswith("file") else ():
             if (path := folder / base / text).exists():
                 first_bytes(path, path, BadConfiguration, 1)
-    size = math.prod(sizes)
-    if size > (most := MOST_COPIES if tag in COPIES else MOST_CELLS):
-        raise BadConfiguration(f"{place_words}: got a size of {size:,.0f}; expected at most {most:,}")
-    return int(size) if tag in COPIES else 1
+    copies_or_cells = math.prod(sizes)
+    if copies_or_cells > (most := MOST_COPIES if tag in COPIES else MOST_CELLS):
+        raise BadConfiguration(f"{place_words}: got a size of {copies_or_cells:,.0f}; expected at most {most:,}")
+    return int(copies_or_cells) if tag in COPIES else 1
 
 
 class _MujocoModel:
@@ -171,8 +171,8 @@ class _MujocoModel:
         root = model.body_rootid[model.jnt_bodyid[joint]]
         is_free = model.jnt_type == library.mjtJoint.mjJNT_FREE
         radius = self._radius(joint)
-        level = abs(float(self.data.xaxis[joint][2])) <= LEVEL
-        rolls = bool((is_free & (model.jnt_bodyid == root)).any()) and radius is not None and level
+        is_level = abs(float(self.data.xaxis[joint][2])) <= LEVEL
+        rolls = bool((is_free & (model.jnt_bodyid == root)).any()) and radius is not None and is_level
         weight = None if rolls else weight
         losses = {
             "friction": (model.dof_frictionloss[dof], "frictionloss"),
@@ -204,17 +204,17 @@ class _MujocoModel:
         full(model, mass, data.qM) if hasattr(data, "qM") else full(model, data, mass)
         return float(mass[dof, dof]) - armature, hanging_torque_and_angle(weights[1], weights[0])
 
-    def _radius(self, joint: int) -> Found | None:
+    def _radius(self, joint: int) -> NumberWithSource | None:
         """Radius of the largest cylinder or sphere about the axis, from collision geometry if there is any."""
-        model, data, geom = self.model, self.data, self.library.mjtGeom
+        model, data, geom_types = self.model, self.data, self.library.mjtGeom
         welded = model.body_weldid[model.jnt_bodyid[joint]]
         radii: list[tuple[bool, float, str]] = []
         for k in range(model.ngeom):
             kind = int(model.geom_type[k])
-            rigid = model.body_weldid[model.geom_bodyid[k]] == welded
-            if not rigid or kind not in (geom.mjGEOM_CYLINDER, geom.mjGEOM_SPHERE):
+            is_rigid = model.body_weldid[model.geom_bodyid[k]] == welded
+            if not is_rigid or kind not in (geom_types.mjGEOM_CYLINDER, geom_types.mjGEOM_SPHERE):
                 continue
-            cylinder_axis = data.geom_xmat[k].reshape(3, 3)[:, 2] if kind == geom.mjGEOM_CYLINDER else None
+            cylinder_axis = data.geom_xmat[k].reshape(3, 3)[:, 2] if kind == geom_types.mjGEOM_CYLINDER else None
             radius, centre = float(model.geom_size[k, 0]), data.geom_xpos[k] - data.xanchor[joint]
             if is_round(centre, data.xaxis[joint], radius, cylinder_axis):
                 shape = "sphere" if cylinder_axis is None else "cylinder"
@@ -222,12 +222,12 @@ class _MujocoModel:
                 radii.append((collides, radius, " ".join(filter(None, ("geom", model.geom(k).name, f"({shape})")))))
         return max(radii)[1:] if radii else None
 
-    def _sides(self, joint: int, radius: float) -> Found:
+    def _sides(self, joint: int, radius: float) -> NumberWithSource:
         """Number of driven wheels like that of a joint, including its own."""
         kinds, driven = self.model.jnt_type, joint in self.actuators
-        alike = [k for k in range(len(kinds)) if kinds[k] == kinds[joint] and (k in self.actuators) == driven]
+        candidates = [k for k in range(len(kinds)) if kinds[k] == kinds[joint] and (k in self.actuators) == driven]
         axes = self.data.xaxis
-        return equal_wheels(radius, axes[joint], ((self.joints[k], self._radius(k), axes[k]) for k in alike))
+        return equal_wheels(radius, axes[joint], ((self.joints[k], self._radius(k), axes[k]) for k in candidates))
 
 
 def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> dict[str, StatedNumber]:
@@ -264,19 +264,19 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
 
 def _effects(dynamic: Sequence[float], bias: Sequence[float], ratio: float) -> dict[str, dict[str, float]]:
     """Effects of a `<dcmotor>`: name → fields."""
-    amplitudes: dict[str, dict[str, float]] = {}
+    fields_by_effect: dict[str, dict[str, float]] = {}
     resistance_thermal, capacity, stiffness = (float(dynamic[k]) for k in (2, 3, 5))
     amplitude, ripples, phase, coulomb, static, fade = (float(x) for x in bias[:6])
     if resistance_thermal > 0:
-        amplitudes["thermal_drift"] = {
+        fields_by_effect["thermal_drift"] = {
             "amplitude": 1.0, "resistance_thermal": resistance_thermal,
             "time_constant": resistance_thermal * capacity,
         }  # fmt: skip
     if amplitude:
-        amplitudes["cogging"] = {"amplitude": -amplitude, "ripples": ripples, "phase": phase}
+        fields_by_effect["cogging"] = {"amplitude": -amplitude, "ripples": ripples, "phase": phase}
     if stiffness > 0:  # from the motor shaft to the joint
-        amplitudes["presliding"] = {"amplitude": coulomb * ratio, "angle_breakaway": static / stiffness / ratio}
+        fields_by_effect["presliding"] = {"amplitude": coulomb * ratio, "angle_breakaway": static / stiffness / ratio}
         if static > coulomb:
             excess = (static - coulomb) * ratio
-            amplitudes["stribeck_exponent"] = {"amplitude": excess, "speed_fade": fade / ratio, "exponent": 2.0}
-    return amplitudes
+            fields_by_effect["stribeck_exponent"] = {"amplitude": excess, "speed_fade": fade / ratio, "exponent": 2.0}
+    return fields_by_effect

@@ -14,8 +14,8 @@ from mmrjax.errors import list_some
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands.rig_numbers import (
     LEVEL,
-    Found,
     JointNumbers,
+    NumberWithSource,
     choose_joint,
     equal_wheels,
     hanging_torque_and_angle,
@@ -72,7 +72,7 @@ class UrdfRobot:
         link = "" if element is None else element.get("link", "")
         return stated_word(link, self.links, f"{self.file}, joint {name}, <{end}>", f"got {link or 'no link'}")
 
-    def chosen(self, joint: str | None) -> str:
+    def turning_joint(self, joint: str | None) -> str:
         """Name of a joint that turns, None for the only driven one.
 
         Raises:
@@ -97,38 +97,38 @@ class UrdfRobot:
         element, link = self.joints[joint], self.child[joint]
         axis = self._axis(joint)
         to_root, root_link = self._to_root(joint)
-        moved_links = list(self._moved(link))
+        moved_links = list(self._moved_links(link))
         inertia, moment, count = 0.0, np.zeros(3), 0
         for name, pose in moved_links:
             mass, inertia_about_axis, first_moment = self._inertial(name, pose, axis)
             inertia, moment, count = inertia + inertia_about_axis, moment + first_moment, count + (mass > 0)
-        named = (
+        links_text = (
             f"link {link}"
             if len(moved_links) == 1
             else (f"link {link} and the {len(moved_links) - 1} links that it carries")
         )
         if count == 0:
-            raise BadConfiguration(f"{self.file}, {named}: no <inertial>; expected its <mass> and <inertia>")
+            raise BadConfiguration(f"{self.file}, {links_text}: no <inertial>; expected its <mass> and <inertia>")
         if inertia < LEAST_INERTIA:
             inertia_text = f"{round(inertia, 12):g} kg·m² about the axis of {joint}"
-            raise BadConfiguration(f"{self.file}, {named}, <inertia>: got {inertia_text}; expected more than 0")
+            raise BadConfiguration(f"{self.file}, {links_text}, <inertia>: got {inertia_text}; expected more than 0")
         radius = self._radius(joint)
-        level = abs(float((to_root[0] @ axis)[2])) <= LEVEL
-        rolls = radius is not None and level and root_link != FIXED_ROOT and element.get("type") == "continuous"
+        is_level = abs(float((to_root[0] @ axis)[2])) <= LEVEL
+        rolls = radius is not None and is_level and root_link != FIXED_ROOT and element.get("type") == "continuous"
         weight = None
         if not rolls:
-            gravity, across = to_root[0].T @ [0.0, 0.0, -GRAVITY], np.cross(axis, moment)
+            gravity, moment_across = to_root[0].T @ [0.0, 0.0, -GRAVITY], np.cross(axis, moment)
             # without the component of the first moment along the axis
-            torque = axis @ np.cross(np.cross(across, axis), gravity)
-            weight = hanging_torque_and_angle(float(torque), float(axis @ np.cross(across, gravity)))
+            torque = axis @ np.cross(np.cross(moment_across, axis), gravity)
+            weight = hanging_torque_and_angle(float(torque), float(axis @ np.cross(moment_across, gravity)))
         numbers = {
             "mass": self._mass(),
             "sides": self._sides(joint, radius[0]) if rolls and radius is not None else None,
             "radius": radius,
-            "inertia": (inertia, f"{named}, <inertia> about the axis"),
+            "inertia": (inertia, f"{links_text}, <inertia> about the axis"),
             "ratio": self._ratio(joint),
-            "weight": None if weight is None else (weight[0], f"{named}, <mass> and its lever"),
-            "angle": None if weight is None else (weight[1], f"{named}, hanging position"),
+            "weight": None if weight is None else (weight[0], f"{links_text}, <mass> and its lever"),
+            "angle": None if weight is None else (weight[1], f"{links_text}, hanging position"),
         }
         for key, unit in {"friction": "N·m", "damping": "N·m·s", "armature": "kg·m²"}.items():
             place = f"joint {joint}, <dynamics {key}>"
@@ -152,13 +152,13 @@ class UrdfRobot:
         rotation = Rotation.from_euler("xyz", angles).as_matrix()
         return rotation, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
 
-    def _moved(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
+    def _moved_links(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
         """Links that turn with a link or are fixed to it, and their poses in its frame with other joints at zero."""
         pending: list[tuple[str, Pose]] = [(link, (np.eye(3), np.zeros(3)))]
         met: set[str] = set()
         while pending:
             name, pose = pending.pop()
-            self._once(name, met)
+            self._reject_loop(name, met)
             yield name, pose
             pending += [
                 (self.child[j], _compose(pose, self._origin(element, f"joint {j}")))
@@ -166,7 +166,7 @@ class UrdfRobot:
                 if self.parent[j] == name and (not rigid or element.get("type") == "fixed")
             ]
 
-    def _once(self, link: str, met: set[str]) -> None:
+    def _reject_loop(self, link: str, met: set[str]) -> None:
         if link in met:
             raise BadConfiguration(f"{self.file}: link {link} is part of a loop; expected a tree")
         met.add(link)
@@ -179,13 +179,13 @@ class UrdfRobot:
         while joint_name is not None:
             pose = _compose(self._origin(self.joints[joint_name], f"joint {joint_name}"), pose)
             link = self.parent[joint_name]
-            self._once(link, met)
+            self._reject_loop(link, met)
             joint_name = above.get(link)
         return pose, link
 
     # --- numbers
 
-    def _mass(self) -> Found | None:
+    def _mass(self) -> NumberWithSource | None:
         masses = [self._link_mass(name) for name in self.links]
         link_masses = [m for m in masses if m]
         lacking = f", {len(masses) - len(link_masses)} more links have none" if len(link_masses) < len(masses) else ""
@@ -209,16 +209,16 @@ class UrdfRobot:
         xx, yy, zz = (self._number(entries, f"i{a}{a}", place_words, "kg·m²", 0.0) for a in "xyz")
         xy, xz, yz = (self._number(entries, f"i{a}", place_words, "kg·m²", None) for a in ("xy", "xz", "yz"))
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        own_axis = rotation.T @ axis
+        axis_in_link = rotation.T @ axis
         lever = np.cross(axis, centre)
-        return mass, float(own_axis @ tensor @ own_axis + mass * lever @ lever), mass * centre
+        return mass, float(axis_in_link @ tensor @ axis_in_link + mass * lever @ lever), mass * centre
 
-    def _radius(self, joint: str) -> Found | None:
+    def _radius(self, joint: str) -> NumberWithSource | None:
         """Radius of the largest cylinder or sphere about the axis, from collision or else visual geometry."""
         axis = self._axis(joint)
         for tag in ("collision", "visual"):
-            radii: list[Found] = []
-            for name, pose in self._moved(self.child[joint], rigid=True):
+            radii: list[NumberWithSource] = []
+            for name, pose in self._moved_links(self.child[joint], rigid=True):
                 for shape in self.links[name].findall(tag):
                     rotation, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
                     for kind, cylinder_axis in (("cylinder", rotation[:, 2]), ("sphere", None)):
@@ -231,7 +231,7 @@ class UrdfRobot:
                 return max(radii)
         return None
 
-    def _sides(self, joint: str, radius: float) -> Found:
+    def _sides(self, joint: str, radius: float) -> NumberWithSource:
         """Number of driven wheels like that of a joint, including its own."""
         axes = {
             name: self._to_root(name)[0][0] @ self._axis(name)
@@ -246,24 +246,24 @@ class UrdfRobot:
                 yield element
 
     def _driven(self, joint: str) -> bool:
-        commanded = any(
+        is_commanded = any(
             ros_joint.get("name") == joint and ros_joint.find("command_interface") is not None
             for ros_joint in self.root.iterfind("ros2_control/joint")
         )
-        return commanded or any(True for _ in self._transmissions(joint))
+        return is_commanded or any(True for _ in self._transmissions(joint))
 
-    def _ratio(self, joint: str) -> Found | None:
+    def _ratio(self, joint: str) -> NumberWithSource | None:
         """Product of the reductions between motor and joint."""
         for element in self._transmissions(joint):
-            shared = len(element.findall("joint")) > 1  # actuators then belong to no single joint
+            is_shared = len(element.findall("joint")) > 1  # actuators then belong to no single joint
             of_joint = [j for j in element.findall("joint") if j.get("name") == joint]
-            owners = of_joint if shared else [element, *of_joint, *element.findall("actuator")]
+            owners = of_joint if is_shared else [element, *of_joint, *element.findall("actuator")]
             reduction_texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
             ratio_texts = [(text, tag) for text, tag in reduction_texts if text is not None]
             if not ratio_texts:
                 continue
             name = f"transmission {element.get('name', '')}, <{ratio_texts[0][1]}>".replace(" ,", ",")
-            ratio = math.prod(abs(self._parsed(text, name, "")) for text, _ in ratio_texts)
+            ratio = math.prod(abs(self._parse_number(text, name, "")) for text, _ in ratio_texts)
             if not ratio >= 1:
                 raise BadConfiguration(f"{self.file}, {name}: got {ratio:g}; expected motor turns per joint turn, "
                                        "1 or more")  # fmt: skip
@@ -276,7 +276,7 @@ class UrdfRobot:
         text = None if element is None else element.get(key)
         if text is None:
             return 0.0
-        value = self._parsed(text, f"{where} {key}" if key not in where else where, unit)
+        value = self._parse_number(text, f"{where} {key}" if key not in where else where, unit)
         if least is not None and value < least:
             raise BadConfiguration(f"{self.file}, {where}: got {key} {value:g}; expected {least:g} {unit} or more")
         return value
@@ -285,12 +285,12 @@ class UrdfRobot:
         text = None if element is None else element.get(key)
         if text is None:
             return np.array(usual)
-        values = [self._parsed(word, f"{where} {key}", "") for word in text.split()]
+        values = [self._parse_number(word, f"{where} {key}", "") for word in text.split()]
         if len(values) != len(usual):
             raise BadConfiguration(f"{self.file}, {where} {key}: got {text!r}; expected {len(usual)} numbers")
         return np.array(values)
 
-    def _parsed(self, text: str | None, where: str, unit: str) -> float:
+    def _parse_number(self, text: str | None, where: str, unit: str) -> float:
         try:
             value = float(text or "")
         except ValueError:

@@ -37,14 +37,14 @@ def joint_numbers(source: Path, joint: str | None) -> JointNumbers:
     Raises:
         BadConfiguration: the file is missing or has another format, or the joint is missing or does not turn.
     """
-    text = file_bytes(source, source, BadConfiguration, LARGEST)
+    content = file_bytes(source, source, BadConfiguration, LARGEST)
     try:
-        _, root = next(ElementTree.iterparse(io.BytesIO(text), ("start",)))
+        _, root = next(ElementTree.iterparse(io.BytesIO(content), ("start",)))
         if root.tag == "robot":
             from sweeps.commands import rig_from_urdf
 
-            robot = rig_from_urdf.UrdfRobot(ElementTree.fromstring(text), source.name)
-            return robot.numbers(robot.chosen(joint))
+            robot = rig_from_urdf.UrdfRobot(ElementTree.fromstring(content), source.name)
+            return robot.numbers(robot.turning_joint(joint))
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # unknown encoding
         raise BadConfiguration(
             f"{source}: not a readable XML file ({error}); expected URDF or MuJoCo's XML"

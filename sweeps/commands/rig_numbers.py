@@ -15,7 +15,7 @@ from calibration.data.stated import HEADER
 from mmrjax.errors import list_some
 
 #: Number, and the element of the model that states it.
-Found = tuple[float, str]
+NumberWithSource = tuple[float, str]
 
 #: Kinds of rig on the ground, and kinds for a joint that turns.
 VEHICLES = ("wheeled", "tracked")
@@ -55,7 +55,7 @@ class JointNumbers:
     file: str
     joint: str
     rolls: bool
-    stated: Mapping[str, Found | None]
+    stated: Mapping[str, NumberWithSource | None]
     drive: Mapping[str, StatedNumber] = dataclasses.field(default_factory=dict)
 
     def kind(self, stated: str | None) -> str:
@@ -75,8 +75,8 @@ class JointNumbers:
         """Numbers for the rig file of this kind, by dotted name."""
         moving = kind in VEHICLES
         losses = "load.track.loss" if moving else "load.loss"
-        others = ("weight", "angle") if moving else ("mass", "radius")
-        pairs = {key: pair for key, pair in self.stated.items() if pair is not None and key not in others}
+        omitted = ("weight", "angle") if moving else ("mass", "radius")
+        pairs = {key: pair for key, pair in self.stated.items() if pair is not None and key not in omitted}
         by_name: dict[str, StatedNumber] = {}
         if "armature" in pairs:
             armature, source = pairs.pop("armature")
@@ -147,7 +147,9 @@ def choose_joint(
     return joint
 
 
-def equal_wheels(radius: float, axis: np.ndarray, joints: Iterable[tuple[str, Found | None, np.ndarray]]) -> Found:
+def equal_wheels(
+    radius: float, axis: np.ndarray, joints: Iterable[tuple[str, NumberWithSource | None, np.ndarray]]
+) -> NumberWithSource:
     """Number of joints with a wheel of the same radius and a parallel axis, and their names.
 
     Args:
@@ -172,16 +174,16 @@ def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[floa
     return (weight, angle) if weight > LEAST_WEIGHT else None
 
 
-def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndarray | None) -> bool:
+def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, own_axis: np.ndarray | None) -> bool:
     """True if a cylinder or sphere turns about its own axis.
 
     Args:
         centre: centre relative to a point on the joint's axis.
         axis: axis of the joint.
-        along: axis of the cylinder. None: a sphere. Axes are unit vectors, shape (3,).
+        own_axis: axis of the cylinder. None: a sphere. Axes are unit vectors, shape (3,).
     """
     distance = np.linalg.norm(np.cross(axis, centre))
-    tilted = 0.0 if along is None else np.linalg.norm(np.cross(axis, along))
+    tilted = 0.0 if own_axis is None else np.linalg.norm(np.cross(axis, own_axis))
     return bool(distance <= OFF_AXIS * radius and tilted <= OFF_AXIS)
 
 
@@ -285,17 +287,19 @@ APART = 0.1
 WIDTH_RESISTANCE, WIDTH_CONSTANT = 5.0, 3.0
 
 
-def _unit_list(text: str) -> str:
+def _normalised_unit(text: str) -> str:
     return re.sub(r"[\s·.*-]", "", text).casefold()
 
 
 def _parse_quantity(name: str, text: str) -> float:
     units = NUMBERS[name]
     expected = f"expected a positive number with a unit: {', '.join(units)}"
-    split = re.fullmatch(r"\s*([-+\d.][\d.]*(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
-    factor = None if split is None else {_unit_list(u): f for u, f in units.items()}.get(_unit_list(split[2]))
+    match = re.fullmatch(r"\s*([-+\d.][\d.]*(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
+    factor = (
+        None if match is None else {_normalised_unit(u): f for u, f in units.items()}.get(_normalised_unit(match[2]))
+    )
     try:
-        value = parse_number(split[1]) if split is not None and factor is not None else math.nan
+        value = parse_number(match[1]) if match is not None and factor is not None else math.nan
     except ValueError:
         value = math.nan
     if not (0 < value < math.inf) or factor is None:
@@ -321,29 +325,29 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
             f"--from-sheet: no motor data; expected --no-load-current and at least three of {other_options}"
         )
     sheet = {name: _parse_quantity(name, text) for name, text in stated.items()}
-    drop = _stall_minus_no_load_current(sheet)
-    voltage, speed, idle, torque, stall, stated_resistance = map(sheet.get, NUMBERS)
-    assert idle is not None
+    difference = _stall_minus_no_load_current(sheet)
+    voltage, speed, no_load, torque, stall, stated_resistance = map(sheet.get, NUMBERS)
+    assert no_load is not None
     resistances = [(stated_resistance, "resistance"), (_ratio_or_none(voltage, stall), "voltage / stall current")]
     if stated_resistance is None and stall is None:
-        resistances.append((_ratio_or_none(voltage, idle + drop), "voltage and power at no load"))
+        resistances.append((_ratio_or_none(voltage, no_load + difference), "voltage and power at no load"))
     if voltage is None and stated_resistance is None and speed is not None and torque is not None:
-        resistances.append((torque * speed / drop**2, "stall torque, no-load speed and stall current"))
+        resistances.append((torque * speed / difference**2, "stall torque, no-load speed and stall current"))
     known_resistances = [(value, source) for value, source in resistances if value is not None]
     resistance = known_resistances[0][0]
-    back_emf = resistance * drop if voltage is None else voltage - resistance * idle
+    back_emf = resistance * difference if voltage is None else voltage - resistance * no_load
     constants = [
         (_ratio_or_none(back_emf, speed), "voltage / no-load speed"),
-        (_ratio_or_none(torque, drop), "stall torque / stall current"),
+        (_ratio_or_none(torque, difference), "stall torque / stall current"),
     ]
     stated_constants = [(value, source) for value, source in constants if value is not None]
     constant = stated_constants[0][0]
-    spread = [_largest_difference(pairs) for pairs in (known_resistances, stated_constants)]
+    differences = [_largest_difference(pairs) for pairs in (known_resistances, stated_constants)]
     groups = (known_resistances, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A")
     faults = [
         f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
         f"{100 * apart:.0f} % apart"
-        for (pairs, name, unit), apart in zip(groups, spread, strict=True)
+        for (pairs, name, unit), apart in zip(groups, differences, strict=True)
         if apart > APART
     ]
     if faults:
@@ -352,25 +356,25 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
             "shaft and one voltage"
         )
 
-    def line(value: float, unit: str, source: str, width: float) -> StatedNumber:
+    def sheet_number(value: float, unit: str, source: str, width: float) -> StatedNumber:
         return StatedNumber(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
 
-    width = max(WIDTH_RESISTANCE, 100 * spread[0]), max(WIDTH_CONSTANT, 100 * spread[1])
+    widths = max(WIDTH_RESISTANCE, 100 * differences[0]), max(WIDTH_CONSTANT, 100 * differences[1])
     return {
-        "motor.resistance": line(resistance, "ohm", known_resistances[0][1], width[0]),
-        "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], width[1]),
-        "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
+        "motor.resistance": sheet_number(resistance, "ohm", known_resistances[0][1], widths[0]),
+        "motor.torque_constant": sheet_number(constant, "N·m/A", stated_constants[0][1], widths[1]),
+        "motor.friction_coulomb": sheet_number(constant * no_load, "N·m", "torque constant × no-load current", 30.0),
         "motor.friction_viscous": StatedNumber(
             0.0,
             "N·m·s",
             "not separated from Coulomb friction, ± as if half were viscous",
-            f"{0.5 * constant**2 * idle / back_emf:.2g}",
+            f"{0.5 * constant**2 * no_load / back_emf:.2g}",
         ),
     }
 
 
-def _ratio_or_none(one: float | None, other: float | None) -> float | None:
-    return None if one is None or other is None else one / other
+def _ratio_or_none(numerator: float | None, denominator: float | None) -> float | None:
+    return None if numerator is None or denominator is None else numerator / denominator
 
 
 def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
@@ -379,27 +383,27 @@ def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
     Raises:
         BadConfiguration: the numbers do not determine it, or the no-load current is not the smaller one.
     """
-    voltage, speed, idle, torque, stall, resistance = map(sheet.get, NUMBERS)
-    if idle is None:
+    voltage, speed, no_load, torque, stall, resistance = map(sheet.get, NUMBERS)
+    if no_load is None:
         raise BadConfiguration("--no-load-current: missing; the motor friction needs it")
     missing = [name for name in NUMBERS if name not in sheet]
     if speed is None and torque is None:
         raise BadConfiguration("--no-load-speed and --stall-torque: both missing; the torque constant needs one")
-    totals = [x for x in (stall, _ratio_or_none(voltage, resistance)) if x is not None]
-    if totals and min(totals) <= idle:
-        raise BadConfiguration(f"--no-load-current: got {three_digits(idle)} A, but the stall current is "
-                               f"{three_digits(min(totals))} A; expected less")  # fmt: skip
-    total = totals[0] if totals else None
-    if total is not None and (resistance is not None or voltage is not None):
-        return total - idle
+    stall_currents = [x for x in (stall, _ratio_or_none(voltage, resistance)) if x is not None]
+    if stall_currents and min(stall_currents) <= no_load:
+        raise BadConfiguration(f"--no-load-current: got {three_digits(no_load)} A, but the stall current is "
+                               f"{three_digits(min(stall_currents))} A; expected less")  # fmt: skip
+    stall_current = stall_currents[0] if stall_currents else None
+    if stall_current is not None and (resistance is not None or voltage is not None):
+        return stall_current - no_load
     if speed is not None and torque is not None:
         power = torque * speed
-        if total is not None:
-            return total - idle
+        if stall_current is not None:
+            return stall_current - no_load
         if resistance is not None:
             return math.sqrt(power / resistance)
         if voltage is not None:  # U D² = M_s ω_0 (D + I_0)
-            return (power + math.sqrt(power**2 + 4 * voltage * power * idle)) / (2 * voltage)
+            return (power + math.sqrt(power**2 + 4 * voltage * power * no_load)) / (2 * voltage)
     lacking = ", ".join(f"--{name}" for name in missing)
     raise BadConfiguration(f"--from-sheet: missing {lacking}; resistance and torque constant need one more")
 

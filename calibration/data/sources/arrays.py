@@ -38,7 +38,10 @@ def signals_of_npz(path: Path, name: str) -> tuple[Signal, ...]:
         if array in arrays:
             raise BadData(f"{name}, {member}: is in the archive twice; expected different names")
         with archive.open(member) as stream:
-            arrays[array] = (*_read_npy_header(stream), functools.cache(functools.partial(_member, archive, member)))
+            arrays[array] = (
+                *_read_npy_header(stream),
+                functools.cache(functools.partial(_load_member, archive, member)),
+            )
     return signals_of_arrays(name, arrays)
 
 
@@ -59,7 +62,7 @@ def _read_npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def _member(archive: zipfile.ZipFile, member: str) -> np.ndarray:
+def _load_member(archive: zipfile.ZipFile, member: str) -> np.ndarray:
     with archive.open(member) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)
 
@@ -101,14 +104,14 @@ def _check_matlab(path: Path, name: str) -> None:
     input_files.check_memory(name, size)
 
 
-def _structure_fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def _structure_fields(path: str, structure: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Arrays of a structure by path. In an array of structures the path has an index."""
-    if value.dtype.names is None:
-        return [(path, value)]
+    if structure.dtype.names is None:
+        return [(path, structure)]
     fields: list[tuple[str, np.ndarray]] = []
-    for k, element in enumerate(np.ravel(value)):
-        field_path = path if value.size == 1 else f"{path}[{k}]"
-        for field in value.dtype.names:
+    for k, element in enumerate(np.ravel(structure)):
+        field_path = path if structure.size == 1 else f"{path}[{k}]"
+        for field in structure.dtype.names:
             fields += _structure_fields(f"{field_path}.{field}", np.asarray(element[field]))
     return fields
 
@@ -125,15 +128,15 @@ def signals_of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
     units: dict[str, str] = {}
     addresses: set[int] = set()
 
-    def add_group(group: Any, at: str) -> None:
+    def add_group(group: Any, path_of_group: str) -> None:
         address = h5py.h5o.get_info(group.id).addr
         if address in addresses:  # a group with several paths is read only under the first one
             return
         addresses.add(address)
         for key in group:
-            if not _inside(group, key, name):
+            if not _is_inside(group, key, name):
                 continue
-            item, item_path = group[key], f"{at}/{key}"
+            item, item_path = group[key], f"{path_of_group}/{key}"
             if isinstance(item, h5py.Group):
                 add_group(item, item_path)
             elif isinstance(item, h5py.Dataset) and item.shape is not None:
@@ -141,21 +144,21 @@ def signals_of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
                     raise BadData(
                         f"{name}, {item_path}: its values are in another file; copy its data into this file"
                     )
-                words = h5py.check_string_dtype(item.dtype) is not None
-                char = matlab and item.attrs.get("MATLAB_class") == b"char"
-                dtype = np.dtype(f"U{item.dtype.itemsize}") if words or char else item.dtype
-                load = functools.cache(functools.partial(_dataset, path, item_path, words, char, matlab))
-                arrays[item_path] = (item.shape[::-1] if matlab else item.shape, dtype, load)
+                is_text = h5py.check_string_dtype(item.dtype) is not None
+                is_char = is_matlab and item.attrs.get("MATLAB_class") == b"char"
+                dtype = np.dtype(f"U{item.dtype.itemsize}") if is_text or is_char else item.dtype
+                load = functools.cache(functools.partial(_load_dataset, path, item_path, is_text, is_char, is_matlab))
+                arrays[item_path] = (item.shape[::-1] if is_matlab else item.shape, dtype, load)
                 unit = next((item.attrs[k] for k in ("unit", "units", "Unit", "Units") if k in item.attrs), "")
                 units[item_path] = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
 
     with h5py.File(path, "r") as file:
-        matlab = any("MATLAB_class" in file[key].attrs for key in file if _inside(file, key, name))
+        is_matlab = any("MATLAB_class" in file[key].attrs for key in file if _is_inside(file, key, name))
         add_group(file, "")
     return signals_of_arrays(name, arrays, units)
 
 
-def _inside(group: Any, key: str, name: str) -> bool:
+def _is_inside(group: Any, key: str, name: str) -> bool:
     import h5py
 
     link = group.get(key, getlink=True)
@@ -167,14 +170,14 @@ def _inside(group: Any, key: str, name: str) -> bool:
     return not isinstance(link, h5py.SoftLink) and not key.startswith("#")
 
 
-def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> np.ndarray:
+def _load_dataset(path: Path, item_path: str, is_text: bool, is_char: bool, is_matlab: bool) -> np.ndarray:
     import h5py
 
     with h5py.File(path, "r") as file:
-        values = np.asarray(file[at].asstr()[()], dtype=str) if words else np.asarray(file[at][()])
-        missing = file[at].attrs.get("_FillValue")  # of netCDF
-    if missing is not None and np.size(missing) == 1 and values.dtype.kind in "iuf":
-        values = np.ma.masked_equal(values, np.ravel(missing)[0])
-    if char:
+        values = np.asarray(file[item_path].asstr()[()], dtype=str) if is_text else np.asarray(file[item_path][()])
+        fill_value = file[item_path].attrs.get("_FillValue")  # of netCDF
+    if fill_value is not None and np.size(fill_value) == 1 and values.dtype.kind in "iuf":
+        values = np.ma.masked_equal(values, np.ravel(fill_value)[0])
+    if is_char:
         return np.array(["".join(map(chr, row)) for row in np.atleast_2d(values.T)])
-    return values.T if matlab else values
+    return values.T if is_matlab else values

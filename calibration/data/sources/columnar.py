@@ -42,7 +42,7 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     """
     library, kind = type(source).__module__.partition(".")[0], type(source).__name__
     if (library, kind) == ("pandas", "DataFrame"):
-        return "the DataFrame", tuple(_of_frame(source))
+        return "the DataFrame", tuple(_signals_of_frame(source))
     if library == "polars" and kind in ("DataFrame", "LazyFrame"):
         try:
             frame = source.collect() if kind == "LazyFrame" else source
@@ -55,7 +55,7 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
         return "the Arrow table", signals_of_arrow_table(pa.table(source))
     if library == "xarray" and kind in ("Dataset", "DataArray"):
         dataset = source if kind == "Dataset" else source.to_dataset(name=source.name or "values")
-        return f"the {kind}", _of_xarray(dataset)
+        return f"the {kind}", _signals_of_xarray(dataset)
     if isinstance(source, np.ndarray) and source.dtype.names:
         fields = {name: array_in_memory(source[name]) for name in source.dtype.names}
         return "the array", signals_of_arrays("the array", fields)
@@ -67,7 +67,7 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     raise BadData(f"the source: got {kind}; expected {EXPECTED}")
 
 
-def _of_frame(frame: Any) -> Iterator[Signal]:
+def _signals_of_frame(frame: Any) -> Iterator[Signal]:
     """Signals of a pandas DataFrame, and of its index if that has a name or times."""
     import pyarrow as pa
 
@@ -83,7 +83,7 @@ def _of_frame(frame: Any) -> Iterator[Signal]:
             yield refused_signal(name, len(frame), refused_type(series.dtype))
 
 
-def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
+def _signals_of_xarray(dataset: Any) -> tuple[Signal, ...]:
     """Signals of a Dataset. If its variables have several dimensions of time, each variable has its own clock."""
     dimensions = {d for v in dataset.data_vars.values() for d in v.dims}
     has_clocks = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1
@@ -91,18 +91,20 @@ def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
     for title, array in {**dataset.coords, **dataset.data_vars}.items():
         if not array.dims:
             continue
-        clock, time, name = None, str(array.dims[0]), str(title)
-        stored = (array.shape, array.dtype, _values(array))
+        clock, dimension, name = None, str(array.dims[0]), str(title)
+        stored_array = (array.shape, array.dtype, _value_loader(array))
         unit = str(array.attrs.get("units", ""))
-        if has_clocks and time in dataset.coords:
-            stamps = dataset.coords[time]
-            clock = Clock(time, _values(stamps), str(stamps.attrs.get("units", "")) or unit_of_clock(time) or "")
-        of_array = signals_of_arrays("the Dataset", {name: stored}, {name: unit})
-        signals += [replace(s, clock=clock) for s in of_array]
+        if has_clocks and dimension in dataset.coords:
+            stamps = dataset.coords[dimension]
+            clock = Clock(
+                dimension, _value_loader(stamps), str(stamps.attrs.get("units", "")) or unit_of_clock(dimension) or ""
+            )
+        signals_of_variable = signals_of_arrays("the Dataset", {name: stored_array}, {name: unit})
+        signals += [replace(s, clock=clock) for s in signals_of_variable]
     return tuple(signals)
 
 
-def _values(array: Any) -> Load:
+def _value_loader(array: Any) -> Load:
     return lambda: np.asarray(array.values)
 
 
@@ -123,16 +125,16 @@ def signals_of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     """
     import pyarrow as pa
 
-    opened = pa.ipc.open_file if input_files.first_bytes(path, name).startswith(b"ARROW1") else pa.ipc.open_stream
+    open_file = pa.ipc.open_file if input_files.first_bytes(path, name).startswith(b"ARROW1") else pa.ipc.open_stream
 
-    def column(k: int) -> Any:
+    def read_column(k: int) -> Any:
         with pa.OSFile(str(path)) as file:
-            return opened(file, options=pa.ipc.IpcReadOptions(included_fields=[k])).read_all().column(0)
+            return open_file(file, options=pa.ipc.IpcReadOptions(included_fields=[k])).read_all().column(0)
 
     with pa.OSFile(str(path)) as file:
-        schema = opened(file).schema
+        schema = open_file(file).schema
     input_files.check_declared(name, len(schema))
-    return _signals(schema, len(column(0)) if len(schema) else 0, column)
+    return _signals(schema, len(read_column(0)) if len(schema) else 0, read_column)
 
 
 def signals_of_arrow_table(table: Any) -> tuple[Signal, ...]:
@@ -140,11 +142,11 @@ def signals_of_arrow_table(table: Any) -> tuple[Signal, ...]:
     return _signals(table.schema, table.num_rows, table.column)
 
 
-def _signals(schema: Any, rows: int, column: Callable[[int], Any]) -> tuple[Signal, ...]:
+def _signals(schema: Any, rows: int, read_column: Callable[[int], Any]) -> tuple[Signal, ...]:
     """Signals of columns. A column of lists has one signal for each element, `name[0]`.
 
     Args:
-        column: function that reads a column by its index.
+        read_column: function that reads a column by its index.
     """
     import pyarrow as pa
     import pyarrow.types as kinds
@@ -152,34 +154,36 @@ def _signals(schema: Any, rows: int, column: Callable[[int], Any]) -> tuple[Sign
 
     signals = []
     for k, field in enumerate(schema):
-        kind, read_column = field.type, functools.partial(column, k)
+        kind, read_values = field.type, functools.partial(read_column, k)
         if not (kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind)) or not rows:
-            signals.append(_signal(field, rows, read_column))
+            signals.append(_signal(field, rows, read_values))
             continue
-        lengths = compute.unique(compute.list_value_length(read_column())).to_pylist()
+        lengths = compute.unique(compute.list_value_length(read_values())).to_pylist()
         if len(lengths) != 1 or not lengths[0]:
             why = "holds lists of several lengths; expected one length in every row"
-            signals.append(Signal(field.name, rows, read_column, refused=why))
+            signals.append(Signal(field.name, rows, read_values, refused=why))
             continue
         for j in range(min(lengths[0], MOST)):
-            element = functools.partial(lambda read, j: compute.list_element(read(), j), read_column, j)
+            element = functools.partial(lambda read, j: compute.list_element(read(), j), read_values, j)
             signals.append(_signal(pa.field(f"{field.name}[{j}]", kind.value_type), rows, element))
     return tuple(signals)
 
 
-def _signal(field: Any, rows: int, column: Callable[[], Any]) -> Signal:
+def _signal(field: Any, rows: int, read_values: Callable[[], Any]) -> Signal:
     import pyarrow.types as kinds
 
     kind, metadata = field.type, field.metadata or {}
     unit = next((metadata[key].decode("utf-8", "replace") for key in _UNITS if key in metadata), "")
     if kinds.is_dictionary(kind):
         kind = kind.value_type
-    words = kinds.is_string(kind) or kinds.is_large_string(kind) or kinds.is_string_view(kind)
-    number = kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind) or kinds.is_decimal(kind)
-    timed = kinds.is_timestamp(kind) or kinds.is_duration(kind)
-    refused = "" if words or number or timed or kinds.is_null(kind) else f"holds {kind}; expected numbers or words"
-    load = lambda: values_of_arrow_column(column())  # noqa: E731
-    return Signal(field.name, rows, load, unit, words=words, refused=refused)
+    is_text = kinds.is_string(kind) or kinds.is_large_string(kind) or kinds.is_string_view(kind)
+    is_number = kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind) or kinds.is_decimal(kind)
+    is_time = kinds.is_timestamp(kind) or kinds.is_duration(kind)
+    refused = (
+        "" if is_text or is_number or is_time or kinds.is_null(kind) else f"holds {kind}; expected numbers or words"
+    )
+    load = lambda: values_of_arrow_column(read_values())  # noqa: E731
+    return Signal(field.name, rows, load, unit, words=is_text, refused=refused)
 
 
 def values_of_arrow_column(column: Any) -> np.ndarray:

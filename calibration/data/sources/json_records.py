@@ -42,16 +42,16 @@ def signals_of_json(path: Path, name: str) -> tuple[Signal, ...]:
     try:
         text = content.decode("utf-8-sig")
         try:
-            found = json.loads(text, object_pairs_hook=_object)
+            parsed = json.loads(text, object_pairs_hook=_object)
         except json.JSONDecodeError:
             lines = [line for line in text.splitlines() if line.strip()]
             if len(lines) < 2 or not lines[0].rstrip().endswith("}"):
                 raise
-            found = [json.loads(line, object_pairs_hook=_object) for line in lines]
+            parsed = [json.loads(line, object_pairs_hook=_object) for line in lines]
     except (ValueError, RecursionError) as error:
         why = "nested too deep" if isinstance(error, RecursionError) else error
         raise BadData(f"{name}: cannot be read as JSON ({why}); it may be cut off; export it again") from error
-    return signals_of_json_content(found, name)
+    return signals_of_json_content(parsed, name)
 
 
 def _object(pairs: list[tuple[str, Any]]) -> Json:
@@ -74,7 +74,7 @@ def signals_of_json_content(content: Any, name: str) -> tuple[Signal, ...]:
         BadData: the content has no table.
     """
     arrays: Json = {}
-    _collect(content, "", arrays, name, 1)
+    _collect_arrays(content, "", arrays, name, 1)
     arrays = _join_tables({path: values for path, values in arrays.items() if values.size})
     if not arrays:
         raise BadData(
@@ -84,34 +84,34 @@ def signals_of_json_content(content: Any, name: str) -> tuple[Signal, ...]:
     return signals_of_arrays(name, {path: array_in_memory(values) for path, values in arrays.items()})
 
 
-def _below(path: str, key: Any) -> str:
+def _joined_path(path: str, key: Any) -> str:
     return f"{path}.{key}" if path else str(key)
 
 
-def _check_depth(name: str, at: str, depth: int) -> None:
+def _check_depth(name: str, path: str, depth: int) -> None:
     if depth > DEEPEST:
-        raise BadData(f"{name}, {at}: is nested too deeply; expected at most {DEEPEST} levels")
+        raise BadData(f"{name}, {path}: is nested too deeply; expected at most {DEEPEST} levels")
 
 
-def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> None:
-    _check_depth(name, at, depth)
+def _collect_arrays(value: Any, path: str, arrays: Columns, name: str, depth: int) -> None:
+    _check_depth(name, path, depth)
     if isinstance(value, Mapping):
         value = _unfold_pandas_dict(value)
     if isinstance(value, Mapping):
         for key, inner in value.items():
-            _collect(inner, _below(at, key), arrays, name, depth + 1)
-        _add_time(value, at, arrays)
+            _collect_arrays(inner, _joined_path(path, key), arrays, name, depth + 1)
+        _add_time(value, path, arrays)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
         if value and all(isinstance(item, Mapping) for item in value):
             columns = _columns_of_episodes(value) or _columns_of_records(value, name)
-            arrays.update({_below(at, key): values for key, values in columns.items()})
+            arrays.update({_joined_path(path, key): values for key, values in columns.items()})
         elif value:
-            arrays[at or "values"] = _array(value)
+            arrays[path or "values"] = _array(value)
     elif hasattr(value, "__array__"):
-        arrays[at or "values"] = value if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
+        arrays[path or "values"] = value if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
 
 
-def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
+def _add_time(value: Mapping[str, Any], path: str, arrays: Columns) -> None:
     """Adds the time of episodes without a clock, if the file states a rate or a step."""
     steps = [
         value[key] ** power
@@ -119,8 +119,8 @@ def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
         if isinstance(value.get(key), int | float) and value[key] > 0
     ]
     for inner in value if steps else ():
-        prefix = f"{_below(at, inner)}."
-        columns = [path.removeprefix(prefix) for path in arrays if path.startswith(prefix)]
+        prefix = f"{_joined_path(path, inner)}."
+        columns = [name.removeprefix(prefix) for name in arrays if name.startswith(prefix)]
         if RUN in columns and not any(unit_of_clock(column) is not None for column in columns):
             runs, row = arrays[prefix + RUN], np.arange(len(arrays[prefix + RUN]))
             first_row = np.maximum.accumulate(np.where(np.r_[True, runs[1:] != runs[:-1]], row, 0))
@@ -159,29 +159,29 @@ def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns:
 
     A text that differs in every record is the name of the run, otherwise its number is.
     """
-    lists = [{key: v for key, v in record.items() if isinstance(v, list) and v} for record in records]
+    episodes = [{key: v for key, v in record.items() if isinstance(v, list) and v} for record in records]
     rows: list[int] = []
-    for episode in lists:
+    for episode in episodes:
         lengths = {len(v) for v in episode.values()}
         is_nested = any(isinstance(v[0], list | Mapping) for v in episode.values())
-        if is_nested or len(lengths) != 1 or lengths == {1} or episode.keys() != lists[0].keys():
+        if is_nested or len(lengths) != 1 or lengths == {1} or episode.keys() != episodes[0].keys():
             return {}
         rows += lengths
-    columns = {key: _array([x for episode in lists for x in episode[key]]) for key in lists[0]}
-    single = [key for key in records[0] if all(isinstance(r.get(key), str | int | float) for r in records)]
-    texts = ([str(record[key]) for record in records] for key in single if isinstance(records[0][key], str))
+    columns = {key: _array([x for episode in episodes for x in episode[key]]) for key in episodes[0]}
+    scalar_keys = [key for key in records[0] if all(isinstance(r.get(key), str | int | float) for r in records)]
+    texts = ([str(record[key]) for record in records] for key in scalar_keys if isinstance(records[0][key], str))
     names = next((v for v in texts if len({*v}) == len(v)), [str(k) for k in range(1, len(records) + 1)])
-    columns |= {key: _array([record[key] for record in records]).repeat(rows) for key in single}
+    columns |= {key: _array([record[key] for record in records]).repeat(rows) for key in scalar_keys}
     return columns | {RUN: np.repeat(names, rows)}
 
 
-def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterable[tuple[str, Any]]:
-    _check_depth(name, at, depth)
+def _leaves(record: Mapping[str, Any], path: str, name: str, depth: int) -> Iterable[tuple[str, Any]]:
+    _check_depth(name, path, depth)
     for key, value in record.items():
         if isinstance(value, Mapping):
-            yield from _leaves(value, _below(at, key), name, depth + 1)
+            yield from _leaves(value, _joined_path(path, key), name, depth + 1)
         else:
-            yield _below(at, key), value
+            yield _joined_path(path, key), value
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:
@@ -203,12 +203,12 @@ def _join_tables(arrays: Columns) -> Columns:
 
     Files of WPILib SysId have such tables: «slow-forward», «fast-backward», ... are lists of rows.
     """
-    shaped = {path: v for path, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf" and v.shape[1] > 1}
-    widths = {v.shape[1] for v in shaped.values()}
-    groups = {parent_path(path) for path in shaped}
-    if len(shaped) < 2 or len(widths) > 1 or len(groups) > 1:
+    matrices = {path: v for path, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf" and v.shape[1] > 1}
+    widths = {v.shape[1] for v in matrices.values()}
+    groups = {parent_path(path) for path in matrices}
+    if len(matrices) < 2 or len(widths) > 1 or len(groups) > 1:
         return arrays
     (above,) = groups
-    other_arrays = {path: v for path, v in arrays.items() if path not in shaped}
-    runs = np.concatenate([np.full(len(v), path_parts(path)[-1]) for path, v in shaped.items()])
-    return other_arrays | {f"{above}rows": np.concatenate(list(shaped.values())), f"{above}{RUN}": runs}
+    other_arrays = {path: v for path, v in arrays.items() if path not in matrices}
+    runs = np.concatenate([np.full(len(v), path_parts(path)[-1]) for path, v in matrices.items()])
+    return other_arrays | {f"{above}rows": np.concatenate(list(matrices.values())), f"{above}{RUN}": runs}

@@ -13,7 +13,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
 from mmrjax.errors import count_noun
 
-#: Clocks that read between these seconds since 1970 (1990 and 2100) count from 1970.
+#: Numbers in this range [s] (1990 to 2100) count from 1970.
 EPOCH = (6.3e8, 4.2e9)
 #: Largest delay of a recorded sample, in usual steps.
 LATE = 20.0
@@ -68,10 +68,10 @@ def guessed_unit(raw: np.ndarray) -> str:
     steps = steps[steps > 0]
     if not len(steps) or (stamps % 1).any():
         return "s"
-    usual = float(np.median(steps))
-    if usual % 100 == 0 and 1e2 < usual <= 1e5 and 1e6 % usual and not (steps % 100).any():
+    step = float(np.median(steps))
+    if step % 100 == 0 and 1e2 < step <= 1e5 and 1e6 % step and not (steps % 100).any():
         return "ms"  # a count of µs has varying last digits
-    return next((unit for unit, largest in _STEPS.items() if usual <= largest), "s")
+    return next((unit for unit, largest in _STEPS.items() if step <= largest), "s")
 
 
 def signals_on_one_grid(
@@ -97,16 +97,16 @@ def signals_on_one_grid(
     """
     clocks = {id(s.clock): s.clock for s in chosen.values() if s.clock is not None}
     try:
-        read = {key: clock_seconds(clock) for key, clock in clocks.items()}
+        clock_readings = {key: clock_seconds(clock) for key, clock in clocks.items()}
     except BadData as error:
         raise BadData(f"{name}, {str(error).removeprefix(f'{name}, ')}") from error
-    begin = min(first for _, first, *_ in read.values())
+    begin = min(first_reading for _, first_reading, *_ in clock_readings.values())
     times: dict[int, np.ndarray] = {}
     order: dict[int, np.ndarray] = {}
     notes = []
-    for key, (time, first, unit, period) in read.items():
+    for key, (time, first_reading, unit, period) in clock_readings.items():
         clock = clocks[key].name
-        time = time + (first - begin)
+        time = time + (first_reading - begin)
         if late := _late_samples(time):
             order[key] = np.argsort(time, kind="stable")
             time = time[order[key]]
@@ -117,30 +117,34 @@ def signals_on_one_grid(
         if period:
             notes.append(f"{name}: {clock} wraps at {period:.10g}. The wraps are removed")
         if not clocks[key].unit and unit not in ("", "s"):
-            notes.append(f"{name}: {clock} has no unit. Its numbers are read as {unit} ({_rate(time)})")
-        _check(name, clock, time)
+            notes.append(f"{name}: {clock} has no unit. Its numbers are read as {unit} ({_rate_text(time)})")
+        _check_clock(name, clock, time)
     grid_clocks = [key for key, clock in clocks.items() if grid and clock.name == grid]
-    of_readings = {id(s.clock) for column, s in chosen.items() if column in measured}
-    main = grid_clocks[0] if grid_clocks else min(of_readings or times, key=lambda key: _step(times[key]))
-    alike = SAME * min(_step(times[main]), 1.0)
+    clocks_of_readings = {id(s.clock) for column, s in chosen.items() if column in measured}
+    grid_clock = (
+        grid_clocks[0] if grid_clocks else min(clocks_of_readings or times, key=lambda key: _median_step(times[key]))
+    )
+    tolerance = SAME * min(_median_step(times[grid_clock]), 1.0)
     starts = [times[id(s.clock)][0] for column, s in chosen.items() if column in held]
-    is_covered = times[main] >= max(starts, default=-np.inf) - alike
-    rows = times[main][is_covered]
+    is_covered = times[grid_clock] >= max(starts, default=-np.inf) - tolerance
+    rows = times[grid_clock][is_covered]
     for key, time in times.items():
         if not len(rows) or time[-1] < rows[0]:
             raise BadData(
-                f"{name}: {clocks[key].name} ends at {time[-1]:g} s, before {clocks[main].name} and every command "
-                "have begun; expected signals that overlap in time"
+                f"{name}: {clocks[key].name} ends at {time[-1]:g} s, before {clocks[grid_clock].name} and every "
+                "command have begun; expected signals that overlap in time"
             )
     values: Columns = {}
     resampled: dict[str, list[str]] = {}
     for column, signal in chosen.items():
         key, signal_values = id(signal.clock), signal.load()
         signal_values = signal_values[order[key]] if key in order else signal_values
-        if np.array_equal(times[key], times[main]):
+        if np.array_equal(times[key], times[grid_clock]):
             values[column] = signal_values[is_covered]
         elif column in held or signal_values.dtype.kind not in "biuf":
-            values[column] = signal_values[np.maximum(np.searchsorted(times[key], rows + alike, side="right") - 1, 0)]
+            values[column] = signal_values[
+                np.maximum(np.searchsorted(times[key], rows + tolerance, side="right") - 1, 0)
+            ]
             resampled.setdefault("held from sample to sample", []).append(column)
         else:
             values[column] = readings_used_once(rows, times[key], signal_values)
@@ -151,8 +155,8 @@ def signals_on_one_grid(
         resampled_words = "; ".join(f"{', '.join(columns)} {how}" for how, columns in resampled.items())
         notes.insert(
             0,
-            f"{name}: signals have different clocks. Rows are taken at the samples of {clocks[main].name} "
-            f"({_rate(times[main])}): {resampled_words}",
+            f"{name}: signals have different clocks. Rows are taken at the samples of {clocks[grid_clock].name} "
+            f"({_rate_text(times[grid_clock])}): {resampled_words}",
         )
     return rows - rows[0], values, tuple(notes)
 
@@ -173,9 +177,9 @@ def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -
     after = np.minimum(np.searchsorted(rows, time), len(rows) - 1)
     before = np.maximum(after - 1, 0)
     nearest = np.where(time - rows[before] <= rows[after] - time, before, after)
-    near = np.unique(nearest[np.abs(rows[nearest] - time) <= max(_step(rows), 1e-9)])
-    near = near[(rows[near] >= time[0]) & (rows[near] <= time[-1])]
-    resampled[near] = np.interp(rows[near], time, numbers)
+    near_rows = np.unique(nearest[np.abs(rows[nearest] - time) <= max(_median_step(rows), 1e-9)])
+    near_rows = near_rows[(rows[near_rows] >= time[0]) & (rows[near_rows] <= time[-1])]
+    resampled[near_rows] = np.interp(rows[near_rows], time, numbers)
     return resampled
 
 
@@ -192,16 +196,16 @@ def usual_step(time: np.ndarray) -> float:
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
 
 
-def _step(time: np.ndarray) -> float:
+def _median_step(time: np.ndarray) -> float:
     return float(np.median(np.diff(time))) if len(time) > 1 else np.inf
 
 
-def _rate(time: np.ndarray) -> str:
-    step = _step(time)
+def _rate_text(time: np.ndarray) -> str:
+    step = _median_step(time)
     return f"{round(1 / step, 3 if step > 1 else 0):g} Hz" if 0 < step < np.inf else "one sample"
 
 
-def _check(name: str, clock: str, time: np.ndarray) -> None:
+def _check_clock(name: str, clock: str, time: np.ndarray) -> None:
     if not len(time):
         raise BadData(f"{name}, {clock}: has no sample; expected time stamps")
     if (rows_of_falls := np.flatnonzero(~(np.diff(time) >= 0))).size:

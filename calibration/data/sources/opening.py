@@ -129,16 +129,20 @@ def format_of(path: Path, name: str) -> Format | None:
                 f"{name}: is a folder without {_METADATA}; expected that file of the bag, or a recording, as "
                 f"{path / parts[0]}"
             )
-    begin = input_files.first_bytes(path, name)
-    form = next((form for magic, form in BEGINNINGS.items() if begin.startswith(magic)), None)
-    if form is None and begin.startswith(b"PK\x03\x04"):
-        form = _kind_of_zip(path)
-    if form is None and any(text.match(begin) for text, word in input_files.TEXTS.items() if word == "JSON"):
-        form = JSON
-    return form or SUFFIXES.get(path.suffix.lower())
+    first_bytes = input_files.first_bytes(path, name)
+    file_format = next(
+        (file_format for magic, file_format in BEGINNINGS.items() if first_bytes.startswith(magic)), None
+    )
+    if file_format is None and first_bytes.startswith(b"PK\x03\x04"):
+        file_format = _format_of_zip(path)
+    if file_format is None and any(
+        text.match(first_bytes) for text, word in input_files.TEXTS.items() if word == "JSON"
+    ):
+        file_format = JSON
+    return file_format or SUFFIXES.get(path.suffix.lower())
 
 
-def _kind_of_zip(path: Path) -> Format | None:
+def _format_of_zip(path: Path) -> Format | None:
     """Format of a zip file by the names in it, or by its suffix if it is damaged."""
     try:
         with zipfile.ZipFile(path) as archive:
@@ -150,15 +154,15 @@ def _kind_of_zip(path: Path) -> Format | None:
     return WORKBOOK if any(name.startswith("xl/") or name == "content.xml" for name in names) else None
 
 
-def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
+def open_signals(path: Path, signal_path: str, name: str, file_format: Format) -> Source:
     """The signals of a file of a format other than text.
 
     Args:
-        within: path of signals in it, empty for all.
+        signal_path: path of signals in it, empty for all.
         name: name of the file, for messages.
 
     Raises:
-        BadData: for the same reasons as `Format.signals`, or there is no signal below `within`.
+        BadData: for the same reasons as `Format.signals`, or there is no signal below `signal_path`.
     """
     files = [path]
     if path.is_dir():
@@ -168,17 +172,17 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
             if not stat.S_ISREG(item.stat().st_mode) and not item.is_dir():
                 raise BadData(f"{name}, {item.name}: is not a regular file; expected the files of a bag")
         files = [file for file in sorted(path.iterdir()) if file.is_file()]
-    signals = tuple(form.signals(path, name))
+    signals = tuple(file_format.signals(path, name))
     if not signals:
-        raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
+        raise BadData(f"{name}: is {file_format.kind} without signals; expected at least one column or array")
     digest = hashlib.sha256()  # of the files in order of their names
     for file in files:
         with file.open("rb") as stream:
             while block := stream.read(2**20):
                 digest.update(block)
     byte_count = sum(file.stat().st_size for file in files)
-    source = checked_source(name, form.kind, signals, byte_count, digest.hexdigest())
-    return source.below(within) if within else source
+    source = checked_source(name, file_format.kind, signals, byte_count, digest.hexdigest())
+    return source.below(signal_path) if signal_path else source
 
 
 def open_object(source: Any) -> Source:

@@ -54,18 +54,20 @@ def read_columns(
             or signals differ in length.
     """
     if not isinstance(source, str | Path):
-        return _of_signals(opening.open_object(source), layout, columns, between)
+        return _columns_of_signals(opening.open_object(source), layout, columns, between)
     if group := opening.files_of_group(str(source)):
-        return _of_group([read_columns(file, layout, columns, between) for file in group], str(source))
-    path, within = opening.split_source(str(source))
+        return _joined_files([read_columns(file, layout, columns, between) for file in group], str(source))
+    path, signal_path = opening.split_source(str(source))
     name = path.name or str(source)
-    form = opening.format_of(path, name)
-    if form is not None:
-        return _of_signals(opening.open_signals(path, within, name, form), layout, columns, between)
-    return _of_table(_with_header(delimited.read_csv_columns(path, name), columns.header), layout, columns)
+    file_format = opening.format_of(path, name)
+    if file_format is not None:
+        return _columns_of_signals(
+            opening.open_signals(path, signal_path, name, file_format), layout, columns, between
+        )
+    return _columns_of_table(_with_header(delimited.read_csv_columns(path, name), columns.header), layout, columns)
 
 
-def _of_group(readings: Sequence[ReadColumns], name: str) -> ReadColumns:
+def _joined_files(readings: Sequence[ReadColumns], name: str) -> ReadColumns:
     """Tables of several files joined into one. Each file is a run, named after the file.
 
     Raises:
@@ -81,7 +83,7 @@ def _of_group(readings: Sequence[ReadColumns], name: str) -> ReadColumns:
                 f"{list_some(differing) if differing else 'the order or units of their columns'}; expected the same "
                 "columns in every file"
             )
-    joined = [
+    values = [
         np.concatenate(parts)
         if all(isinstance(v, np.ndarray) for v in parts)
         else list(itertools.chain(*map(column_texts, parts)))
@@ -89,24 +91,24 @@ def _of_group(readings: Sequence[ReadColumns], name: str) -> ReadColumns:
     ]
     header, units = first.header, first.units
     if RUN not in header:
-        joined.append([Path(table.name).stem for table in tables for _ in range(len(table))])
+        values.append([Path(table.name).stem for table in tables for _ in range(len(table))])
         header, units = (*header, RUN), (*units, "") if units else ()
     digest = hashlib.sha256("".join(table.digest for table in tables).encode()).hexdigest()
     notes = tuple(dict.fromkeys(note for table in tables for note in table.notes))
-    return NamedArrays(name, header, tuple(joined), units, first.units_from, notes, digest), readings[0][1]
+    return NamedArrays(name, header, tuple(values), units, first.units_from, notes, digest), readings[0][1]
 
 
-def read_whole_table(path: Path, within: str = "") -> NamedArrays:
+def read_whole_table(path: Path, signal_path: str = "") -> NamedArrays:
     """All columns of a table in a file, unchanged.
 
     Raises:
         BadData: for the same reasons as `read_columns`. Signals with separate clocks, which do not form one table.
     """
     name = path.name or str(path)
-    form = opening.format_of(path, name)
-    if form is None:
+    file_format = opening.format_of(path, name)
+    if file_format is None:
         return delimited.read_csv_columns(path, name)
-    source = opening.open_signals(path, within, name, form)
+    source = opening.open_signals(path, signal_path, name, file_format)
     signals = {s.path if len(matching_signals(source.signals, s.name)) > 1 else s.name: s for s in source.signals}
     for signal in signals.values():
         if signal.refused or signal.clock is not None:
@@ -131,7 +133,7 @@ def _with_header(arrays: NamedArrays, header: Names) -> NamedArrays:
     return replace(arrays, header=header, values=values, notes=(*arrays.notes, note))
 
 
-def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset) -> ReadColumns:
+def _columns_of_table(arrays: NamedArrays, layout: Layout, columns: Preset) -> ReadColumns:
     by_name = dict(zip(arrays.header, arrays.values, strict=True))
 
     def has_readings(name: str) -> bool:
@@ -155,7 +157,7 @@ def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
     """
     notes = []
     for column in preset.columns:
-        name = next((name for name in column.theirs if name in values), None)
+        name = next((name for name in column.source_columns if name in values), None)
         if name is not None and column.across in values:
             q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (name, column.across))
             if d > WEAKENED * q:
@@ -169,23 +171,23 @@ def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
 def _check_any_found(name: str, columns: Preset, is_found: bool, header: Sequence[str]) -> None:
     """Rejects a source without any column of a preset."""
     if columns.columns and not is_found:
-        patterns, has = (list_some(x, 120) for x in ([c.theirs[0] for c in columns.columns], header))
+        patterns, present = (list_some(x, 120) for x in ([c.source_columns[0] for c in columns.columns], header))
         raise BadData(
-            f"{name}: has none of the columns of {columns.name} ({patterns}), but {has}; correct the names, or "
+            f"{name}: has none of the columns of {columns.name} ({patterns}), but {present}; correct the names, or "
             "choose another preset"
         )
 
 
-def _of_signals(source: Source, layout: Layout, columns: Preset, between: str) -> ReadColumns:
+def _columns_of_signals(source: Source, layout: Layout, columns: Preset, between: str) -> ReadColumns:
     """Columns of the signals with a meaning, and of some others."""
     signals = source.signals
 
-    def found(name: str) -> str | None:
+    def present_path(name: str) -> str | None:
         matches = matching_signals(signals, name)
         return matches[0].path if "*" in name and len(matches) == 1 else name if matches else None
 
-    mapped, notes = columns.mapped(found)
-    is_found = any(found(pattern) for _, pattern, _ in mapped)
+    mapped, notes = columns.mapped(present_path)
+    is_found = any(present_path(pattern) for _, pattern, _ in mapped)
     _check_any_found(source.name, columns, is_found, [s.path for s in signals])
     columns.check_needed(mapped, layout.imposed_column, source.name)
     mapped = presets_file.merge_columns(mapped, layout.mapped)
@@ -202,11 +204,11 @@ def _of_signals(source: Source, layout: Layout, columns: Preset, between: str) -
         name: _decoded_signal(columns.column_of(name), signal) for name, signal in signals_by_column.items()
     }
     if has_clocks:
-        values, more = _on_a_grid(source, signals_by_column, layout, between, clock, mapped)
+        values, further_notes = _on_a_grid(source, signals_by_column, layout, between, clock, mapped)
     else:
-        values, more = _in_rows(source, signals_by_column), ()
+        values, further_notes = _in_rows(source, signals_by_column), ()
         values |= _in_rows(source, extras, len(next(iter(values.values()), [])))
-    notes = (*source.notes, *more, *notes, *weakened_field_notes(columns, values), *missing)
+    notes = (*source.notes, *further_notes, *notes, *weakened_field_notes(columns, values), *missing)
     return _arrays(source, values, signals_by_column, notes), mapped
 
 
@@ -218,21 +220,22 @@ def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dic
     signals_by_column: dict[str, Signal] = {}
     clock, missing = "", []
     clocks = {s.clock.name for s in source.signals if s.clock is not None}
-    for own_column, pattern, _ in mapped:
-        meant = {s.path for s in matching_signals(source.signals, pattern)}
-        if pattern in clocks or (meant and meant <= clocks):  # several clocks: each signal has its own
-            clock = pattern if pattern in clocks else meant.pop() if len(meant) == 1 else ""
-        elif meant:
+    for column, pattern, _ in mapped:
+        matches = {s.path for s in matching_signals(source.signals, pattern)}
+        if pattern in clocks or (matches and matches <= clocks):  # several clocks: each signal has its own
+            clock = pattern if pattern in clocks else matches.pop() if len(matches) == 1 else ""
+        elif matches:
             signals_by_column[pattern] = find_signal(source.signals, pattern, source.name)
         else:
             near = suggested_paths(pattern, [s.path for s in source.signals])
-            missing.append(f"{source.name}: no signal {pattern}, from which {own_column} is read; {near}")
+            missing.append(f"{source.name}: no signal {pattern}, from which {column} is read; {near}")
     spellings = replace(layout, channels=channels.EVERY, mapped=()).spellings()
     spelled = {name.casefold() for name in spellings}
     used_signals = {id(signal) for signal in signals_by_column.values()}
     for signal in source.signals:
-        vague = signal.clock is not None and signal.name in (*WORDS, *WHEN)  # the mode in a topic has another meaning
-        if signal.name.casefold() in spelled and id(signal) not in used_signals and not vague:
+        # The mode in a topic has another meaning.
+        is_vague = signal.clock is not None and signal.name in (*WORDS, *WHEN)
+        if signal.name.casefold() in spelled and id(signal) not in used_signals and not is_vague:
             signals_by_column.setdefault(signal.name, signal)
     return signals_by_column, clock, tuple(missing)
 
@@ -241,11 +244,11 @@ def _decode_raw_numbers(column: presets_file.PresetColumn, raw: Raw) -> Raw:
     """Raw numbers converted to signed numbers around zero. Cells without a number are unchanged."""
     if not (column.sign_bit or column.zero):
         return raw
-    numbers, sign = column_numbers(raw), 2.0**column.sign_bit
-    counted = np.where(bool(column.sign_bit) & (numbers >= sign), sign - numbers, numbers) - column.zero
+    numbers, sign_value = column_numbers(raw), 2.0**column.sign_bit
+    decoded = np.where(bool(column.sign_bit) & (numbers >= sign_value), sign_value - numbers, numbers) - column.zero
     if isinstance(raw, np.ndarray):
-        return counted
-    return [cell if np.isnan(x) else repr(x) for cell, x in zip(raw, counted.tolist(), strict=True)]
+        return decoded
+    return [cell if np.isnan(x) else repr(x) for cell, x in zip(raw, decoded.tolist(), strict=True)]
 
 
 def _decoded_signal(column: presets_file.PresetColumn, signal: Signal) -> Signal:
@@ -268,9 +271,9 @@ def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> Co
     rows = rows or max(lengths.values(), default=0)
     for column, length in lengths.items():
         if length not in (1, rows):
-            other = next((signals[c].path for c, n in lengths.items() if n == rows), "the time of the others")
+            longest = next((signals[c].path for c, n in lengths.items() if n == rows), "the time of the others")
             raise BadData(
-                f"{source.name}, {signals[column].path}: has {length} values, and {other} has {rows}; "
+                f"{source.name}, {signals[column].path}: has {length} values, and {longest} has {rows}; "
                 "expected equal lengths, or its own time stamps, as an array named time in the same group"
             )
     columns = {}
@@ -287,8 +290,8 @@ def _on_a_grid(
     meanings = replace(layout, mapped=mapped).meanings(source.name, list(chosen))
     column_of = {c: "" if m is None else m.column for c, m in zip(chosen, meanings, strict=True)}
     signals = {c: s for c, s in chosen.items() if column_of[c] not in TIME}
-    over_time = {c: s for c, s in signals.items() if s.clock is not None}
-    if not over_time:
+    clocked = {c: s for c, s in signals.items() if s.clock is not None}
+    if not clocked:
         paths = [s.path for s in source.signals]
         raise BadData(
             f"{source.name}: no signal has the name of a column; {suggested_paths('', paths)}; give their columns in "
@@ -299,9 +302,9 @@ def _on_a_grid(
     stepwise = chosen.keys() - measured
     if between == "linear" or layout.imposed_column == SPEED:
         stepwise -= {c for c in chosen if column_of[c] == layout.imposed_column}
-    time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, stepwise, measured, clock)
-    rest = {c: s for c, s in signals.items() if s.clock is None}
-    return {"time_s": time, **values, **_in_rows(source, rest, len(time))}, notes
+    time, values, notes = one_clock.signals_on_one_grid(source.name, clocked, stepwise, measured, clock)
+    unclocked = {c: s for c, s in signals.items() if s.clock is None}
+    return {"time_s": time, **values, **_in_rows(source, unclocked, len(time))}, notes
 
 
 def _raw_values(values: np.ndarray) -> Raw:

@@ -170,9 +170,9 @@ def find_signal(signals: Sequence[Signal], name: str, where: str) -> Signal:
 
 def suggested_paths(name: str, paths: Sequence[str]) -> str:
     """Hint for an unknown name: up to three similar paths, otherwise the first `LISTED` paths."""
-    close = similar_words(name, paths, 3)
-    if close:
-        return f"did you mean {', '.join(close)}?"
+    similar = similar_words(name, paths, 3)
+    if similar:
+        return f"did you mean {', '.join(similar)}?"
     return f"it has {', '.join(paths[:LISTED])}{', ...' if len(paths) > LISTED else ''}"
 
 
@@ -213,14 +213,14 @@ def signals_of_arrays(
         for path, (shape, dtype, load) in arrays.items():
             unit = unit_of_clock(path_parts(path)[-1])
             if unit is not None and dtype.kind in "iufM" and sum(n > 1 for n in shape) == 1:
-                of_length = clocks.setdefault(lengths[path], {})
-                of_length.setdefault(parent_path(path), Clock(path, _flat(load), unit))
+                clocks_by_group = clocks.setdefault(lengths[path], {})
+                clocks_by_group.setdefault(parent_path(path), Clock(path, _flattened(load), unit))
     signals: list[Signal] = []
     for path, array in arrays.items():
-        of_length = clocks.get(lengths[path], {})
-        only = next(iter(of_length.values())) if len(of_length) == 1 else None
-        clock = of_length.get(parent_path(path), only)
-        signals += _of_array(path, *array, (units or {}).get(path, ""), clock)
+        clocks_by_group = clocks.get(lengths[path], {})
+        only_clock = next(iter(clocks_by_group.values())) if len(clocks_by_group) == 1 else None
+        clock = clocks_by_group.get(parent_path(path), only_clock)
+        signals += _signals_of_array(path, *array, (units or {}).get(path, ""), clock)
     return tuple(signals)
 
 
@@ -242,25 +242,25 @@ def _column_count(shape: tuple[int, ...], dtype: np.dtype) -> int:
     return columns * sum(_column_count((), dtype[name]) for name in dtype.names) if dtype.names else columns
 
 
-def _flat(load: Load) -> Load:
+def _flattened(load: Load) -> Load:
     return lambda: np.ravel(load())
 
 
-def _of_array(
+def _signals_of_array(
     path: str, shape: tuple[int, ...], dtype: np.dtype, load: Load, unit: str, clock: Clock | None
 ) -> list[Signal]:
     if dtype.names:
-        fields = [_of_array(f"{path}.{n}", shape, dtype[n], part_of(load, n), "", clock) for n in dtype.names]
+        fields = [_signals_of_array(f"{path}.{n}", shape, dtype[n], part_of(load, n), "", clock) for n in dtype.names]
         return [signal for signals in fields for signal in signals]
-    words, refused = dtype.kind in "US", refused_type(dtype)
+    is_text, refused = dtype.kind in "US", refused_type(dtype)
     if not refused and len(shape) > 2:
         refused = f"has {len(shape)} dimensions; expected one, or two for several signals"
     size = float(math.prod(shape)) * max(dtype.itemsize, input_files.VALUE)
-    parts = {path: _flat(load)}
+    parts = {path: _flattened(load)}
     if not refused and len(shape) == 2 and 1 not in shape:
         parts = {f"{path}[{j}]": part_of(load, np.s_[:, j]) for j in range(shape[1])}
     n = sample_count(shape)
-    return [Signal(p, n, part, unit, clock, words, refused, size) for p, part in parts.items()]
+    return [Signal(p, n, part, unit, clock, is_text, refused, size) for p, part in parts.items()]
 
 
 @dataclass(frozen=True)

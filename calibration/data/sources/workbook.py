@@ -79,16 +79,16 @@ def _signal(cells: Any, path: str, place: str, unit: str) -> Signal:
     import pandas as pd
 
     numbers = pd.to_numeric(cells, errors="coerce")
-    wrong = cells[numbers.isna() & cells.notna()]
-    words = len(wrong) > numbers.notna().sum()
+    not_numbers = cells[numbers.isna() & cells.notna()]
+    is_text = len(not_numbers) > numbers.notna().sum()
 
     def load() -> np.ndarray:
         if pd.api.types.is_datetime64_any_dtype(cells.dtype):
             return cells.to_numpy("datetime64[ns]")
-        if words:
+        if is_text:
             return cells.fillna("").astype(str).to_numpy(str)
-        if len(wrong):
-            raise BadData(f"{place}: got {str(wrong.iloc[0])[:40]!r} among numbers; expected a number")
+        if len(not_numbers):
+            raise BadData(f"{place}: got {str(not_numbers.iloc[0])[:40]!r} among numbers; expected a number")
         return numbers.to_numpy(float)
 
-    return Signal(path, len(cells), load, unit, words=words)
+    return Signal(path, len(cells), load, unit, words=is_text)
