@@ -9,13 +9,13 @@ from typing import Any
 from calibration.data import Names
 
 
-def describe(found: Any, part: str = "", *about: str) -> str:
-    """English sentence of a note or a result, such as a calibration's `remarks` or what `discover` returns.
+def describe(subject: Any, part: str = "", *about: str) -> str:
+    """English sentence of a note or a result, such as a calibration's `remarks` or a result of `discover`.
 
     Args:
-        found: a remark, a result, or a sentence, which is returned unchanged.
+        subject: a remark, a result, or a sentence, which is returned unchanged.
         part: part of a result: `header` of its robot file, or `standing` of the names in the loop. "": its answer.
-        about: name of the robot, for a header.
+        about: further arguments of the part: the name of the robot, for a header.
 
     Returns:
         The sentence, "" if there is nothing to report.
@@ -23,21 +23,21 @@ def describe(found: Any, part: str = "", *about: str) -> str:
     Raises:
         TypeError: there is no sentence for this kind of object or part.
     """
-    if isinstance(found, str):
-        return found
+    if isinstance(subject, str):
+        return subject
     # results and notes are described by methods of their own, so their module cannot be imported above
-    tables = importlib.import_module("calibration.words.note_words")
-    if isinstance(found, tables.Remark) and not part:
-        sentence = tables.NOTES[found.code]
+    word_tables = importlib.import_module("calibration.words.note_words")
+    if isinstance(subject, word_tables.Remark) and not part:
+        sentence = word_tables.NOTES[subject.code]
         if isinstance(sentence, str):
-            values_text = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in found.values.items()}
+            values_text = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in subject.values.items()}
             return sentence.format(**values_text)
-        return sentence(**found.values)
-    sentence = tables.PARTS.get((type(found), part)) if part else tables.RESULTS.get(type(found))
+        return sentence(**subject.values)
+    sentence = word_tables.PARTS.get((type(subject), part)) if part else word_tables.RESULTS.get(type(subject))
     if sentence is None:
-        kind = type(found).__name__ + (f", {part}" if part else "")
+        kind = type(subject).__name__ + (f", {part}" if part else "")
         raise TypeError(f"describe: got {kind}; expected a note or a result of calibrate, discover or sensitivity")
-    return sentence(found, *about)
+    return sentence(subject, *about)
 
 
 def sentences(notes: Iterable[object]) -> Names:

@@ -33,24 +33,24 @@ MOST_LOST = 0.5
 Analyse = Callable[[np.ndarray], tuple[Any, float]]
 
 
-def _sampled_scores(study: Study, unit: np.ndarray, which: Sequence[int]) -> np.ndarray:
+def _sampled_scores(study: Study, unit: np.ndarray, indices: Sequence[int]) -> np.ndarray:
     """Scores of all inputs, for points in the unit cube of some inputs. The other inputs are at their medians."""
-    unit_scores = np.full((len(unit), len(study.inputs)), 0.5)
-    unit_scores[:, which] = unit
-    return study.inputs.scores(unit_scores)
+    unit_points = np.full((len(unit), len(study.inputs)), 0.5)
+    unit_points[:, indices] = unit
+    return study.inputs.scores(unit_points)
 
 
 def _results_at_points(
     study: Study,
     studies: dict[str, OutputStudy],
-    moving: np.ndarray,
+    is_sampled: np.ndarray,
     design: Callable[[tuple[int, ...]], tuple[np.ndarray, Analyse]],
 ) -> Iterator[tuple[str, OutputStudy, dict[int, Any]]]:
     """Yields for each output its name, the study without results of the sample, and the result at each point.
 
     Args:
         studies: local study of each output.
-        moving: True for inputs that are sampled, shape (inputs,).
+        is_sampled: True for inputs that are sampled, shape (inputs,).
         design: function that returns sampled scores for some inputs, and the analysis of their outputs.
     """
     points = len(study.points)
@@ -58,7 +58,7 @@ def _results_at_points(
     lost = {name: np.zeros(points) for name in studies}
     groups: dict[tuple[int, ...], list[int]] = {}  # of points with the same inputs
     for k in range(points):
-        groups.setdefault(tuple(i for i in study.acting(k) if moving[i]), []).append(k)
+        groups.setdefault(tuple(i for i in study.acting(k) if is_sampled[i]), []).append(k)
     groups.pop((), None)
     for input_set, group in groups.items():
         scores, analyse = design(input_set)
@@ -67,25 +67,25 @@ def _results_at_points(
                 result, lost[name][k] = analyse(outputs[name])
                 if result is not None and lost[name][k] <= MOST_LOST:
                     results[name][k] = result
-    for name, local in studies.items():
+    for name, local_study in studies.items():
         studied = np.isin(np.arange(points), list(results[name]))
-        share = np.full_like(local.share, np.nan)
-        yield name, dataclasses.replace(local, share=share, lost=lost[name], studied=studied), results[name]
+        share = np.full_like(local_study.share, np.nan)
+        yield name, dataclasses.replace(local_study, share=share, lost=lost[name], studied=studied), results[name]
 
 
 def _estimates_at_points(
     study: Study, by_point: Mapping[int, Mapping[str, IntervalEstimate]], names: Iterable[str]
 ) -> dict[str, IntervalEstimate]:
     """Estimates at each point, by name, shape (points, inputs), NaN at points without one."""
-    every = {name: np.full((3, len(study.points), len(study.inputs)), np.nan) for name in names}
-    for name, estimates in every.items():
-        for k, of_point in by_point.items():
-            estimates[:, k] = of_point[name]
-    return {name: IntervalEstimate(*estimates) for name, estimates in every.items()}
+    arrays = {name: np.full((3, len(study.points), len(study.inputs)), np.nan) for name in names}
+    for name, estimates in arrays.items():
+        for k, point_estimates in by_point.items():
+            estimates[:, k] = point_estimates[name]
+    return {name: IntervalEstimate(*estimates) for name, estimates in arrays.items()}
 
 
 def sobol_study(
-    study: Study, studies: dict[str, OutputStudy], moving: np.ndarray, evaluations: int, seed: int
+    study: Study, studies: dict[str, OutputStudy], is_sampled: np.ndarray, evaluations: int, seed: int
 ) -> dict[str, OutputStudy]:
     """First-order, total and second-order Sobol indices at each point and over all points."""
 
@@ -101,25 +101,25 @@ def sobol_study(
 
         return _sampled_scores(study, unit, input_set), analyse
 
-    answer = {}
-    for name, output, terms in _results_at_points(study, studies, moving, design):
+    studies_by_name = {}
+    for name, output, terms in _results_at_points(study, studies, is_sampled, design):
         if terms:
-            indices = {k: sampled_indices.sobol_indices(of_point) for k, of_point in terms.items()}
+            indices = {k: sampled_indices.sobol_indices(point_terms) for k, point_terms in terms.items()}
             overall = sampled_indices.sobol_indices(functools.reduce(operator.add, terms.values()))
             second = overall.pop("second")
             at_points = _estimates_at_points(study, indices, overall)
             sd = np.full(len(study.points), np.nan)
-            sd[list(terms)] = np.sqrt([of_point.variance.mean() for of_point in terms.values()])
+            sd[list(terms)] = np.sqrt([point_terms.variance.mean() for point_terms in terms.values()])
             output = dataclasses.replace(
                 output, overall=overall, at_points=at_points, share=np.clip(at_points["total"].value, 0.0, 1.0),
                 sd=sd, second=second,
             )  # fmt: skip
-        answer[name] = output
-    return answer
+        studies_by_name[name] = output
+    return studies_by_name
 
 
 def morris_study(
-    study: Study, studies: dict[str, OutputStudy], moving: np.ndarray, evaluations: int, seed: int
+    study: Study, studies: dict[str, OutputStudy], is_sampled: np.ndarray, evaluations: int, seed: int
 ) -> dict[str, OutputStudy]:
     """Elementary effects (Morris) over the 95 % range of each input, at each point."""
 
@@ -146,8 +146,8 @@ def morris_study(
 
         return scores, analyse
 
-    answer = {}
-    for name, output, effects in _results_at_points(study, studies, moving, design):
+    studies_by_name = {}
+    for name, output, effects in _results_at_points(study, studies, is_sampled, design):
         if effects:
             at_points = _estimates_at_points(study, effects, next(iter(effects.values())))
             square = at_points["mean_absolute_effect"].value ** 2
@@ -161,8 +161,8 @@ def morris_study(
                 at_points=at_points,
                 share=square / np.where(total > 0, total, 1.0),
             )
-        answer[name] = output
-    return answer
+        studies_by_name[name] = output
+    return studies_by_name
 
 
 #: Default number of model evaluations: without and with outputs of a run over time.
@@ -186,29 +186,31 @@ def analyse_sensitivity(study: Study, method: str, evaluations: int | None, seed
     inputs, model = study.inputs, study.model
     if inputs.is_posterior and method != "local":
         raise BadConfiguration(f"--method {method}: needs independent inputs, unlike a posterior's; expected local")
-    long = fidelities.fidelity_facts(model.fidelity).rollout or any(o in derived.OF_START for o in model.outputs)
-    usual = EVALUATIONS_LONG if long else EVALUATIONS
-    evaluations = usual if evaluations is None else evaluations
+    is_rollout = fidelities.fidelity_facts(model.fidelity).rollout or any(
+        o in derived.OF_START for o in model.outputs
+    )
+    default_evaluations = EVALUATIONS_LONG if is_rollout else EVALUATIONS
+    evaluations = default_evaluations if evaluations is None else evaluations
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
     study.tell(progress_remark("points"))
     outputs, statuses = local_studies(study)
     if not any(np.isfinite(o.value).any() for o in outputs.values()):
         raise BadConfiguration(_no_point_message(statuses))
-    idle = inert_inputs(study, outputs, seed)
-    if idle.all():
+    inert = inert_inputs(study, outputs, seed)
+    if inert.all():
         raise BadConfiguration("--parameters: every derivative is zero; choose others, or change --outputs")
     if method != "local":
         study.tell(Remark("sampling", method=method, points=len(study.points)))
-        by_method = sobol_study if method == "sobol" else morris_study
-        outputs = by_method(study, outputs, ~idle, evaluations, seed)
+        run_method = sobol_study if method == "sobol" else morris_study
+        outputs = run_method(study, outputs, ~inert, evaluations, seed)
         if not any(s.studied.any() for s in outputs.values()):
             raise BadConfiguration(_no_point_message(study.statuses()))
     return SensitivityResult(
         method=method,
         model=model.fidelity,
         seed=seed,
-        inputs=_describe_inputs(inputs, idle),
+        inputs=_describe_inputs(inputs, inert),
         correlated=inputs.is_posterior,
         points=study.points,
         outputs=outputs,
@@ -216,23 +218,24 @@ def analyse_sensitivity(study: Study, method: str, evaluations: int | None, seed
         sampled=study.statuses(),
         evaluations=study.evaluations,
         seconds=round(study.seconds, 3),
-        remarks=_study_remarks(study, method, outputs, idle),
+        remarks=_study_remarks(study, method, outputs, inert),
     )
 
 
-def _describe_inputs(inputs: UncertainInputs, idle: np.ndarray) -> dict[str, InputSummary]:
-    slope = inputs.slope[inputs.places]
+def _describe_inputs(inputs: UncertainInputs, inert: np.ndarray) -> dict[str, InputSummary]:
+    slope = inputs.slope[inputs.column_indices]
     sd = np.where(inputs.uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
-    low, high = (np.diag(inputs.values(ends)[:, inputs.places]) for ends in interval_ends(inputs))
-    median = inputs.values(inputs.centre)[inputs.places]
-    described = {}
+    low, high = (np.diag(inputs.values(ends)[:, inputs.column_indices]) for ends in interval_ends(inputs))
+    median = inputs.values(inputs.centre)[inputs.column_indices]
+    summaries = {}
     for k, (name, uniform) in enumerate(zip(inputs.names, inputs.uniform, strict=True)):
         kind = "uniform" if uniform else "posterior" if inputs.is_posterior else inputs.parameters.kinds[k]
-        axis, interval = inputs.axes[name], (float(low[k]), float(high[k]))
-        described[name] = InputSummary(
-            axis.unit, axis.meaning, kind, float(median[k]), interval, float(sd[k]), bool(idle[k])
+        axis = inputs.axes[name]
+        interval = (float(low[k]), float(high[k]))
+        summaries[name] = InputSummary(
+            axis.unit, axis.meaning, kind, float(median[k]), interval, float(sd[k]), bool(inert[k])
         )
-    return described
+    return summaries
 
 
 def _no_point_message(statuses: dict[str, dict[str, int]]) -> str:
@@ -246,23 +249,27 @@ def _no_point_message(statuses: dict[str, dict[str, int]]) -> str:
 
 
 def _study_remarks(
-    study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray
+    study: Study, method: str, outputs: dict[str, OutputStudy], inert: np.ndarray
 ) -> tuple[Remark, ...]:
     remarks: list[Remark] = []
-    alike: dict[tuple[bytes, bytes], list[OutputStudy]] = {}
+    groups: dict[tuple[bytes, bytes], list[OutputStudy]] = {}
     for o in outputs.values():
-        alike.setdefault((o.studied.tobytes(), o.lost.tobytes()), []).append(o)
-    for group in alike.values():
-        o, names = group[0], tuple(x.row.label for x in group)
-        out, total = int(np.sum(~o.studied)), len(o.studied)
-        if out:
+        groups.setdefault((o.studied.tobytes(), o.lost.tobytes()), []).append(o)
+    for group in groups.values():
+        o = group[0]
+        names = tuple(x.row.label for x in group)
+        left_out = int(np.sum(~o.studied))
+        total = len(o.studied)
+        if left_out:
             sampled = method != "local"
-            remarks.append(Remark("points_left_out", points=out, total=total, sampled=sampled, outputs=names))
-        some = o.lost[o.studied & (o.lost >= 1e-3)]
-        if some.size:
-            remarks.append(Remark("sample_left_out", points=some.size, share=float(some.max()), outputs=names))
-    if idle.any():
-        remarks.append(Remark("inert", inputs=tuple(np.array(study.inputs.names)[idle].tolist())))
+            remarks.append(Remark("points_left_out", points=left_out, total=total, sampled=sampled, outputs=names))
+        lost_shares = o.lost[o.studied & (o.lost >= 1e-3)]
+        if lost_shares.size:
+            remarks.append(
+                Remark("sample_left_out", points=lost_shares.size, share=float(lost_shares.max()), outputs=names)
+            )
+    if inert.any():
+        remarks.append(Remark("inert", inputs=tuple(np.array(study.inputs.names)[inert].tolist())))
     if study.inputs.parameters.tied:
         remarks.append(Remark("tied", inputs=tuple(f for f, _, _ in study.inputs.parameters.tied)))
     return tuple(remarks)

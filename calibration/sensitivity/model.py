@@ -55,18 +55,23 @@ def known_outputs(robot: Robot) -> dict[str, Quantity]:
 
 def default_outputs(robot: Robot, turns: bool) -> Names:
     """Names of the outputs that are studied by default: every channel, and those defined for the robot's load."""
-    outputs, names = known_outputs(robot), channels.channel_names(robot.channels)
+    outputs = known_outputs(robot)
+    names = channels.channel_names(robot.channels)
     if turns:
-        return (*names, *(n for n in DEFAULT if outputs[n] not in derived.OF_STRAIGHT), derived.OF_TURNS[0].name)
+        return (
+            *names,
+            *(name for name in DEFAULT if outputs[name] not in derived.OF_STRAIGHT),
+            derived.OF_TURNS[0].name,
+        )
     if not robot.has_ground:
         names = (*names, "power_supply")
     else:  # no slope stalls an imposed speed
         stalls = robot.rig.imposed != "motor_speed"
         names = (*names, *(name for name in DEFAULT if stalls or name != "steepest_slope"))
-    return tuple(n for n in names if robot.knows(outputs[n].rests_on))
+    return tuple(name for name in names if robot.knows(outputs[name].rests_on))
 
 
-def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
+def chosen_outputs(names_or_groups: Names, robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
     """Outputs with these names, or the default ones if none is given. `start` stands for all outputs of a start.
 
     Args:
@@ -76,31 +81,32 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
         BadConfiguration: a name is unknown (the message lists the choices). Also if an output needs a ground or
             stance that the robot lacks, or a turn in straight travel, or straight travel in a turn.
     """
-    outputs, outputs_chosen = known_outputs(robot), []
-    start = tuple(d.name for d in derived.OF_START)
+    outputs = known_outputs(robot)
+    chosen = []
+    start_names = tuple(d.name for d in derived.OF_START)
     of_turns = {*(o.name for o in derived.OF_TURNS), *(c.name for c in channels.OF_TURNS if c.settled)}
-    for word in words or default_outputs(robot, turns):
-        for name in start if word == "start" else (word,):
+    for word in names_or_groups or default_outputs(robot, turns):
+        for name in start_names if word == "start" else (word,):
             if not turns and name in of_turns and name not in channels.channel_names(robot.channels):
                 raise BadConfiguration(
                     f"--outputs {name}: the robot travels straight; drive its sides differently, e.g. --vary "
                     f"{OF_SIDES[0]}=0.2:0.8"
                 )
             stated_word(name, [*outputs, "start"], f"--outputs {name}", "no such output")
-            if (row := outputs[name]) in derived.OF_GROUND and not robot.has_ground:
+            if (output := outputs[name]) in derived.OF_GROUND and not robot.has_ground:
                 raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which has no ground")
-            if lacking := robot.unknown(row.rests_on):
+            if unstated := robot.unknown(output.rests_on):
                 raise BadConfiguration(
-                    f"--outputs {name}: not known, as the robot's file does not state {' and '.join(lacking)}"
+                    f"--outputs {name}: not known, as the robot's file does not state {' and '.join(unstated)}"
                 )
-            if turns and row in derived.OF_STRAIGHT:
+            if turns and output in derived.OF_STRAIGHT:
                 raise BadConfiguration(
                     f"--outputs {word}: only for straight travel, but varied inputs make the robot turn"
                 )
-            if row in derived.OF_POSTURE and (why := reason_without_stance(robot)):
-                raise BadConfiguration(f"--outputs {name}: {why}")
-            outputs_chosen.append(row)
-    return tuple(dict.fromkeys(outputs_chosen))
+            if output in derived.OF_POSTURE and (reason := reason_without_stance(robot)):
+                raise BadConfiguration(f"--outputs {name}: {reason}")
+            chosen.append(output)
+    return tuple(dict.fromkeys(chosen))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,8 +136,16 @@ class Model:
 
     def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
         """Number of points in one call."""
-        long = source == derived.START or (source in fidelities.TABLE and fidelities.fidelity_facts(source).rollout)
-        kind = ("derivatives of runs" if long else "derivatives") if differentiated else "runs" if long else "solves"
+        is_rollout = source == derived.START or (
+            source in fidelities.TABLE and fidelities.fidelity_facts(source).rollout
+        )
+        kind = (
+            ("derivatives of runs" if is_rollout else "derivatives")
+            if differentiated
+            else "runs"
+            if is_rollout
+            else "solves"
+        )
         few, many = CHUNKS[kind]
         return few if points <= 4 * few else many
 
@@ -179,19 +193,21 @@ class Model:
         """Results of `_values` or `_derivatives` for one source, in chunks of equal size. The last chunk is padded
         with its last point.
         """
-        variation, names = Variation(self.robot, self.columns), tuple(o.name for o in self.sources[source])
+        variation = Variation(self.robot, self.columns)
+        names = tuple(o.name for o in self.sources[source])
         options = dict(self.options) if source == self.fidelity else {}
-        points, size = len(values), self.chunk(source, len(values), differentiated=function is _derivatives)
-        alike = conditions.shape == ()  # broadcast by the program
-        parts = []
-        for first in range(0, points, size):
-            rows = np.minimum(np.arange(first, first + size), points - 1)
+        points = len(values)
+        chunk_size = self.chunk(source, len(values), differentiated=function is _derivatives)
+        is_shared = conditions.shape == ()  # broadcast by the program
+        chunks = []
+        for first in range(0, points, chunk_size):
+            rows = np.minimum(np.arange(first, first + chunk_size), points - 1)
             row_conditions = (
-                conditions if alike else jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], conditions)
+                conditions if is_shared else jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], conditions)
             )
-            part = function(variation, source, options, names, jnp.asarray(np.asarray(values)[rows]), row_conditions)
-            parts.append({name: np.asarray(x)[: points - first] for name, x in part.items()})
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            chunk = function(variation, source, options, names, jnp.asarray(np.asarray(values)[rows]), row_conditions)
+            chunks.append({name: np.asarray(x)[: points - first] for name, x in chunk.items()})
+        return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
 
 
 def _outputs(
@@ -228,16 +244,18 @@ def _derivatives(
 ) -> dict[str, Array]:
     """Jacobian of all points. One tangent per column suffices, since outputs of a point depend only on its row."""
 
-    def numbers(values: Array) -> tuple[dict[str, Array], Array]:
-        made = _outputs(variation, source, options, names, values, conditions)
-        status = made.pop(STATUS)
-        return made, status
+    def values_and_status(values: Array) -> tuple[dict[str, Array], Array]:
+        results = _outputs(variation, source, options, names, values, conditions)
+        status = results.pop(STATUS)
+        return results, status
 
-    def along(direction: Array) -> tuple[dict[str, Array], Array]:
+    def derivative_along(direction: Array) -> tuple[dict[str, Array], Array]:
         _, derivative, status = jax.jvp(
-            numbers, (values,), (jnp.broadcast_to(direction, values.shape),), has_aux=True
+            values_and_status, (values,), (jnp.broadcast_to(direction, values.shape),), has_aux=True
         )
         return derivative, status
 
-    derivatives, status = jax.vmap(along, out_axes=(-1, None))(jnp.eye(values.shape[1], dtype=values.dtype))
+    derivatives, status = jax.vmap(derivative_along, out_axes=(-1, None))(
+        jnp.eye(values.shape[1], dtype=values.dtype)
+    )
     return {**derivatives, STATUS: status}

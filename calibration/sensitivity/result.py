@@ -46,13 +46,14 @@ class OperatingPoints:
     @classmethod
     def of(cls, runs: Runs) -> OperatingPoints:
         """Operating points of a table of runs."""
-        layout, nothing = runs.layout, np.zeros(len(runs))
-        payload, slope = (runs[c] if c in runs.axes else nothing for c in ("payload_kg", "slope_deg"))
+        layout = runs.layout
+        zeros = np.zeros(len(runs))
+        payload, slope = (runs[c] if c in runs.axes else zeros for c in ("payload_kg", "slope_deg"))
         imposed = runs[layout.imposed_column]
         imposes_speed = layout.imposed == "motor_speed"
         return cls(
             runs["configuration"],
-            nothing if imposes_speed else imposed,
+            zeros if imposes_speed else imposed,
             payload,
             slope,
             imposed if imposes_speed else None,
@@ -86,10 +87,10 @@ class OperatingPoints:
 
     def columns(self) -> Columns:
         """Columns of the points, as in tables of runs."""
-        further = (
+        imposed_column = (
             {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
         )
-        return {"configuration": self.configuration, **further, **{column: x for column, x, _ in self.ground}}
+        return {"configuration": self.configuration, **imposed_column, **{column: x for column, x, _ in self.ground}}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,8 +207,8 @@ class SensitivityResult:
         for study in self.outputs.values():
             total = study.at_points.get("total")
             shares += [study.overall_share[None], study.share, *([] if total is None else [total.high])]
-        finite = np.nan_to_num(np.concatenate(shares), posinf=0.0, neginf=0.0)
-        return np.clip(finite.max(0), 0.0, 1.0)
+        finite_shares = np.nan_to_num(np.concatenate(shares), posinf=0.0, neginf=0.0)
+        return np.clip(finite_shares.max(0), 0.0, 1.0)
 
     @property
     def negligible(self) -> Names:

@@ -120,12 +120,12 @@ class VarianceTerms:
         """Terms of both outputs together, as for a vector of outputs (Gamboa et al., Electron. J. Stat. 8 (2014))."""
         return VarianceTerms(*map(operator.add, dataclasses.astuple(self), dataclasses.astuple(other)))
 
-    def widened(self, places: Sequence[int], inputs: int) -> VarianceTerms:
-        """Terms for more inputs: these terms at `places`, the others without influence."""
+    def widened(self, indices: Sequence[int], inputs: int) -> VarianceTerms:
+        """Terms for more inputs: these terms at `indices`, the others without influence."""
         first, total = np.zeros((2, len(self.variance), inputs))
-        first[:, places], total[:, places] = self.first, self.total
+        first[:, indices], total[:, indices] = self.first, self.total
         second = first[:, :, None] + first[:, None, :]  # without interaction
-        second[:, np.array(places)[:, None], places] = self.second
+        second[:, np.array(indices)[:, None], indices] = self.second
         return dataclasses.replace(self, first=first, total=total, second=second)
 
 
@@ -204,20 +204,23 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> tuple[dict[str
         None if fewer than two trajectories have values at all points.
     """
     inputs = points.shape[1]
-    paths, values_by_path = points.reshape(-1, inputs + 1, inputs), values.reshape(-1, inputs + 1)
+    paths = points.reshape(-1, inputs + 1, inputs)
+    values_by_path = values.reshape(-1, inputs + 1)
     finite = np.isfinite(values_by_path).all(1)
     if finite.sum() < 2:
         return None
     steps = np.diff(paths[finite], axis=1)
-    moved_input = np.abs(steps).argmax(-1)[..., None]
-    changes = np.diff(values_by_path[finite], axis=1)[..., None] / np.take_along_axis(steps, moved_input, -1)
+    moved_index = np.abs(steps).argmax(-1)[..., None]
+    changes = np.diff(values_by_path[finite], axis=1)[..., None] / np.take_along_axis(steps, moved_index, -1)
     effects = np.zeros((len(changes), inputs))
-    np.put_along_axis(effects, moved_input[..., 0], changes[..., 0], 1)
-    size, mean, sd = np.abs(effects).mean(0), effects.mean(0), effects.std(0, ddof=1)
+    np.put_along_axis(effects, moved_index[..., 0], changes[..., 0], 1)
+    mean_magnitude = np.abs(effects).mean(0)
+    mean = effects.mean(0)
+    sd = effects.std(0, ddof=1)
     width = float(stats.t.ppf(0.5 + LEVEL / 2, len(effects) - 1)) / np.sqrt(len(effects))
     error = width * np.abs(effects).std(0, ddof=1)
     return {
-        "mean_absolute_effect": IntervalEstimate(size, size - error, size + error),
+        "mean_absolute_effect": IntervalEstimate(mean_magnitude, mean_magnitude - error, mean_magnitude + error),
         "mean_effect": IntervalEstimate(mean, mean, mean),
         "sd_effect": IntervalEstimate(sd, sd, sd),
     }, int(np.sum(~finite))

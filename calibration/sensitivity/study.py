@@ -64,7 +64,7 @@ class Study:
             motor_speed=None if points.motor_speed is None else points.motor_speed * RPM,
         )
         self.evaluations, self.seconds = 0, 0.0
-        self.told = time.perf_counter()
+        self.last_report_time = time.perf_counter()
         self.sampled: Columns = {}
 
     def at(self, k: int) -> Conditions:
@@ -80,28 +80,30 @@ class Study:
 
         A source is not computed again if only conditions that it ignores differ.
         """
-        sampled: dict[tuple[str, tuple[float, ...]], ModelOutputs] = {}
+        outputs_by_conditions: dict[tuple[str, tuple[float, ...]], ModelOutputs] = {}
         for k in points:
-            began = time.perf_counter()
+            start_time = time.perf_counter()
             conditions = self.at(k)
             parts = {}
             for source in self.model.sources:
                 ignored = self.model.ignores(source)
                 fields = {f.name: getattr(conditions, f.name) for f in dataclasses.fields(conditions)}
-                mark = tuple(float(x) for name, x in fields.items() if x is not None and name not in ignored)
-                parts[source] = sampled.get((source, mark)) or self.model.of_source(source, values, conditions)
+                key = tuple(float(x) for name, x in fields.items() if x is not None and name not in ignored)
+                parts[source] = outputs_by_conditions.get((source, key)) or self.model.of_source(
+                    source, values, conditions
+                )
                 if ignored:  # otherwise no other point can reuse it
-                    sampled[source, mark] = parts[source]
-            answer = self.model.joined(parts)
-            self.seconds += time.perf_counter() - began
+                    outputs_by_conditions[source, key] = parts[source]
+            outputs = self.model.joined(parts)
+            self.seconds += time.perf_counter() - start_time
             self.evaluations += len(values)
-            for source, codes in answer.statuses.items():
+            for source, codes in outputs.statuses.items():
                 self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
-            if time.perf_counter() - self.told > SILENCE:
-                self.told = time.perf_counter()
+            if time.perf_counter() - self.last_report_time > SILENCE:
+                self.last_report_time = time.perf_counter()
                 rate = self.evaluations / max(self.seconds, 1e-9)
                 self.tell(progress_remark("evaluations", self.evaluations, rate))
-            yield k, answer.values
+            yield k, outputs.values
 
     def statuses(self) -> dict[str, dict[str, int]]:
         """Source → status → number of evaluations in the sample."""
@@ -114,7 +116,7 @@ def source_words(source: str) -> str:
 
 
 #: Numbers of random robots and points at which an input must have zero derivatives to count as inert.
-LOOKS, PLACES = 4, 12
+INERT_SAMPLES, INERT_POINTS = 4, 12
 
 
 def correlated_directions(inputs: UncertainInputs) -> np.ndarray:
@@ -122,48 +124,52 @@ def correlated_directions(inputs: UncertainInputs) -> np.ndarray:
 
     Each row has length 1. A condition moves along its own score.
     """
-    p = len(inputs.parameters)
+    count = len(inputs.parameters)
     directions = np.eye(len(inputs))
     root = inputs.parameters.root
     length = np.linalg.norm(root, axis=1, keepdims=True)
-    directions[:p, :p] = root / np.where(length > 0, length, 1.0)
+    directions[:count, :count] = root / np.where(length > 0, length, 1.0)
     return directions
 
 
 def interval_ends(inputs: UncertainInputs) -> Float[np.ndarray, "2 inputs inputs"]:
     """Scores with one input at the lower or upper end of its 95 % interval, in a row for each input."""
-    reach = np.where(inputs.uniform, 0.475, Z95)[:, None] * correlated_directions(inputs)
-    return inputs.centre + np.stack([-reach, reach])
+    half_widths = np.where(inputs.uniform, 0.475, Z95)[:, None] * correlated_directions(inputs)
+    return inputs.centre + np.stack([-half_widths, half_widths])
 
 
 def local_studies(study: Study) -> tuple[dict[str, OutputStudy], dict[str, dict[str, int]]]:
     """Study of each output from its exact derivatives at the medians of the inputs, and the number of points with
     each status, by source.
     """
-    inputs, points, d = study.inputs, len(study.points), len(study.inputs)
+    inputs = study.inputs
+    points = len(study.points)
+    d = len(study.inputs)
     values = study.inputs.values(np.tile(inputs.centre, (points, 1)))
-    answer = study.model(values, study.conditions)
-    spread = jax.tree.map(lambda x: np.repeat(np.asarray(x), d), study.conditions)
+    at_medians = study.model(values, study.conditions)
+    repeated_conditions = jax.tree.map(lambda x: np.repeat(np.asarray(x), d), study.conditions)
     ends = [
-        study.model(study.inputs.values(np.tile(rows, (points, 1))), spread).values for rows in interval_ends(inputs)
+        study.model(study.inputs.values(np.tile(rows, (points, 1))), repeated_conditions).values
+        for rows in interval_ends(inputs)
     ]
     # A condition's score is uniform in 0..1, with variance 1/12.
-    weight = np.where(inputs.uniform, 1 / 12, 1.0)
-    by_columns, outputs = study.model.derivatives(values, study.conditions), {}
+    score_variance = np.where(inputs.uniform, 1 / 12, 1.0)
+    by_columns = study.model.derivatives(values, study.conditions)
+    studies = {}
     for row in study.model.outputs:
-        value, derivatives = answer.values[row.name], by_columns[row.name]
+        value, derivatives = at_medians.values[row.name], by_columns[row.name]
         finite = np.isfinite(value)
-        slopes = np.where(finite[:, None], _derivatives_by_input(inputs, derivatives), np.nan)
-        scores = np.where(finite[:, None], derivatives @ inputs.slope, np.nan)
-        along = scores @ correlated_directions(inputs).T if inputs.is_posterior else scores
-        variance = np.sum(scores**2 * weight, 1)
-        share = along**2 * weight / np.where(variance > 0, variance, 1.0)[:, None]
+        input_slopes = np.where(finite[:, None], _derivatives_by_input(inputs, derivatives), np.nan)
+        score_slopes = np.where(finite[:, None], derivatives @ inputs.slope, np.nan)
+        slopes_along = score_slopes @ correlated_directions(inputs).T if inputs.is_posterior else score_slopes
+        variance = np.sum(score_slopes**2 * score_variance, 1)
+        share = slopes_along**2 * score_variance / np.where(variance > 0, variance, 1.0)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
-            elasticity = slopes * inputs.values(inputs.centre)[inputs.places] / value[:, None]
-        outputs[row.name] = OutputStudy(
+            elasticity = input_slopes * inputs.values(inputs.centre)[inputs.column_indices] / value[:, None]
+        studies[row.name] = OutputStudy(
             row=row,
             value=value,
-            derivative=slopes,
+            derivative=input_slopes,
             elasticity=np.where(np.isfinite(elasticity), elasticity, np.nan),
             swing=np.stack([end[row.name].reshape(points, d) for end in ends]),
             sd=np.where(finite, np.sqrt(variance), np.nan),
@@ -171,15 +177,17 @@ def local_studies(study: Study) -> tuple[dict[str, OutputStudy], dict[str, dict[
             lost=np.zeros(points),
             studied=finite,
         )
-    statuses = {source_words(source): named_counts(np.bincount(codes)) for source, codes in answer.statuses.items()}
-    return outputs, statuses
+    statuses = {
+        source_words(source): named_counts(np.bincount(codes)) for source, codes in at_medians.statuses.items()
+    }
+    return studies, statuses
 
 
 def _derivatives_by_input(inputs: UncertainInputs, by_columns: np.ndarray) -> np.ndarray:
     """Derivatives with respect to inputs, shape (points, inputs), from those with respect to columns. Tied parameters
     are added to their leader.
     """
-    by_inputs = by_columns[:, inputs.places].copy()
+    by_inputs = by_columns[:, inputs.column_indices].copy()
     for j, (_, leader, ratio) in enumerate(inputs.parameters.tied):
         by_inputs[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]
     return by_inputs
@@ -187,17 +195,17 @@ def _derivatives_by_input(inputs: UncertainInputs, by_columns: np.ndarray) -> np
 
 def inert_inputs(study: Study, outputs: Mapping[str, OutputStudy], seed: int) -> np.ndarray:
     """True for inputs whose derivatives of all outputs are exactly zero at all tested points, shape (inputs,)."""
-    streams = np.random.default_rng(seed).spawn(LOOKS)
-    unit = np.concatenate([qmc.Sobol(len(study.inputs), scramble=True, rng=rng).random(1) for rng in streams])
+    generators = np.random.default_rng(seed).spawn(INERT_SAMPLES)
+    unit = np.concatenate([qmc.Sobol(len(study.inputs), scramble=True, rng=rng).random(1) for rng in generators])
     scores = study.inputs.scores(unit)
-    moving = np.zeros(len(study.inputs), bool)
+    has_effect = np.zeros(len(study.inputs), bool)
     for output in outputs.values():  # not scores, which mix the parameters of a posterior
-        moving |= (np.nan_to_num(output.derivative) != 0).any(0)
-    if moving.all():
-        return ~moving
-    points = np.unique(np.linspace(0, len(study.points) - 1, PLACES).astype(int))
+        has_effect |= (np.nan_to_num(output.derivative) != 0).any(0)
+    if has_effect.all():
+        return ~has_effect
+    points = np.unique(np.linspace(0, len(study.points) - 1, INERT_POINTS).astype(int))
     rows = np.repeat(scores, len(points), 0)
     conditions = jax.tree.map(lambda x: np.tile(np.asarray(x)[points], len(scores)), study.conditions)
-    for g in study.model.derivatives(study.inputs.values(rows), conditions).values():
-        moving |= (np.nan_to_num(_derivatives_by_input(study.inputs, g)) != 0).any(0)
-    return ~moving
+    for derivatives in study.model.derivatives(study.inputs.values(rows), conditions).values():
+        has_effect |= (np.nan_to_num(_derivatives_by_input(study.inputs, derivatives)) != 0).any(0)
+    return ~has_effect

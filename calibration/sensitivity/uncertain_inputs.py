@@ -30,7 +30,7 @@ from mmrjax.model.robot import Robot
 EDGE = 1e-9
 
 #: Distribution without parameters.
-NOTHING = Posterior(
+NO_PARAMETERS = Posterior(
     coordinates=(), units=(), mean=np.zeros(0), covariance=np.zeros((0, 0)), location=np.zeros(0), spread=np.zeros(0),
     low=np.zeros(0), high=np.zeros(0), softness=np.zeros(0), kinds=(),
 )  # fmt: skip
@@ -105,19 +105,25 @@ class UncertainInputs:
         return np.where(self.uniform, 0.5, 0.0)
 
     @property
-    def places(self) -> np.ndarray:
+    def column_indices(self) -> np.ndarray:
         """Index of each input in `columns`."""
         p, tied = len(self.parameters), len(self.parameters.tied)
         return np.concatenate([np.arange(p), np.arange(p + tied, p + tied + len(self.conditions))])
 
-    def acting(self, configuration: str, others: Sequence[str]) -> np.ndarray:
+    def acting(self, configuration: str, configurations: Sequence[str]) -> np.ndarray:
         """Indices of the inputs that act in a configuration."""
-        foreign = tuple(f"{name}." for name in others if name != configuration)
-        return np.array([k for k, name in enumerate(self.names) if not name.startswith(foreign)], int)
+        other_prefixes = tuple(f"{name}." for name in configurations if name != configuration)
+        return np.array([k for k, name in enumerate(self.names) if not name.startswith(other_prefixes)], int)
 
 
 #: Parameters that are inputs of a rig only if its file states a prior for them.
-_OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_", "motor.temperature_ambient")
+_FROM_OTHER_ROBOTS = (
+    "driver.",
+    "rig.",
+    "motor.resistance_thermal_",
+    "motor.time_constant_",
+    "motor.temperature_ambient",
+)
 
 
 def default_input_names(
@@ -128,15 +134,15 @@ def default_input_names(
     Parameters of an unused battery, guide parameters on wheels, and parameters that the fidelity does not use (in
     straight travel or in turns) are left out.
     """
-    absent = [name for name in robot.configurations if name not in configurations]
-    wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
-    excluded = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
-    guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
+    absent_configurations = [name for name in robot.configurations if name not in configurations]
+    wheeled = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
+    excluded = tuple(f"{name}." for name in absent_configurations) + (() if battery else ("battery.",))
+    guide_names = {f"{name}.{g}" for name in wheeled for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
     by_name = params.parameters_by_name(robot)
-    left_out = {*guides, *fidelities.unread_parameters(model, by_name, turns), *robot.rig.exact}
+    left_out = {*guide_names, *fidelities.unread_parameters(model, by_name, turns), *robot.rig.exact}
     if not robot.rig.inherits:  # parameters of another robot do not count
         prior_names = {name for name, _, _ in robot.rig.priors}
-        left_out |= {name for name in by_name if name.startswith(_OTHERS) and name not in prior_names} | {
+        left_out |= {name for name in by_name if name.startswith(_FROM_OTHER_ROBOTS) and name not in prior_names} | {
             *robot.rig.unknown
         }
     return tuple(
@@ -172,15 +178,17 @@ def inputs_from_priors(
         coordinates = priors.parameter_coordinates(robot, names) if names else None
     except BadConfiguration as error:
         raise BadConfiguration(str(error).replace("--prior", "--parameters")) from None
-    size = len(names)
-    parameters = posterior_of_coordinates(coordinates, np.zeros(size), np.eye(size)) if coordinates else NOTHING
+    count = len(names)
+    parameters = (
+        posterior_of_coordinates(coordinates, np.zeros(count), np.eye(count)) if coordinates else NO_PARAMETERS
+    )
     return inputs_from_posterior(robot, parameters, ranges, is_posterior=False)
 
 
 def inputs_from_posterior(
     robot: Robot, parameters: Posterior, ranges: Mapping[str, tuple[float, float]], *, is_posterior: bool = True
 ) -> UncertainInputs:
-    """Inputs from the posterior of a calibrated robot, or another distribution, and from ranges of conditions."""
+    """Inputs from ranges of conditions and the posterior of a calibrated robot, or another distribution."""
     for name in ranges:
         stated_word(name, [n for n in CONDITIONS if n != "configuration"], f"--vary {name}", "no such condition")
     try:
@@ -188,10 +196,10 @@ def inputs_from_posterior(
     except UsageError as error:
         raise BadConfiguration(str(error)) from None
     for name, (low, high) in ranges.items():
-        least, most = axes[name].bounds
-        if not (math.isfinite(low) and math.isfinite(high) and least <= low < high <= most):
+        lowest, highest = axes[name].bounds
+        if not (math.isfinite(low) and math.isfinite(high) and lowest <= low < high <= highest):
             raise BadConfiguration(
-                f"--vary {name}: got {low:g} to {high:g}; expected a range within {least:g} to {most:g} "
+                f"--vary {name}: got {low:g} to {high:g}; expected a range within {lowest:g} to {highest:g} "
                 f"{axes[name].unit}, the smaller end first"
             )
     ends = np.array(list(ranges.values()), float).reshape(-1, 2)

@@ -20,10 +20,10 @@ from mmrjax.derived.requirements import (
     QUANTITIES,
     EnvelopePoint,
     Ratings,
+    evaluate_requirement,
     thermal_margin,
     travel_quantities,
 )
-from mmrjax.derived.requirements import evaluate_requirement as requirement
 from mmrjax.model import params
 from mmrjax.model.quantities import CHARGE, SLOPE
 from mmrjax.model.robot import Robot
@@ -66,21 +66,21 @@ def build_robot(robot: Robot, base_mass: float, configuration: str, design: Desi
     used share of its capacity as in the initial robot. Parallel cells divide its resistance by their number.
     """
     ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
-    d, c = design.drive, design.cell
-    added_mass = d["mass"] + design.cells * parallel * c["mass"] - base_mass
+    drive, cell = design.drive, design.cell
+    added_mass = drive["mass"] + design.cells * parallel * cell["mass"] - base_mass
     values: Json = {
-        **{f"motor.{key}": d[key] for key in (
+        **{f"motor.{key}": drive[key] for key in (
             "resistance", "torque_constant", "friction_coulomb", "friction_viscous", "inertia", "inductance",
             "resistance_thermal_winding", "resistance_thermal_housing",
         )},
-        "gearbox.ratio": ratio, "gearbox.efficiency_load": d["efficiency"],
-        "battery.capacity": parallel * c["capacity"], "battery.voltage_full": c["voltage_full"],
-        "battery.resistance": c["resistance"] / parallel,
+        "gearbox.ratio": ratio, "gearbox.efficiency_load": drive["efficiency"],
+        "battery.capacity": parallel * cell["capacity"], "battery.voltage_full": cell["voltage_full"],
+        "battery.resistance": cell["resistance"] / parallel,
         **{f"{name}.mass": chassis.mass + added_mass for name, chassis in robot.configurations.items()},
         f"{configuration}.radius": radius,
     }  # fmt: skip
-    rated = Ratings(design.cells, c["cutoff"], d["temperature"], d["torque"])
-    return params.replace(robot, values), rated
+    ratings = Ratings(design.cells, cell["cutoff"], drive["temperature"], drive["torque"])
+    return params.replace(robot, values), ratings
 
 
 class SizingTask(eqx.Module):
@@ -110,37 +110,38 @@ class SizingTask(eqx.Module):
         return (*(requirement_label(r) for r, _ in self.demands), *RATED)
 
 
-def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -> SizingTask:
+def build_sizing_task(robot: Robot, requirements: Requirements, options: PartOptions) -> SizingTask:
     """Evaluation points and demands of requirements. Points are the corners of each envelope, without repeats.
 
     A required slope or payload is a condition in which the robot must travel. Ratings of parts apply at points of
-    continuous
-    travel: those of such requirements or, if there are none, the middle of the envelope.
+    continuous travel: those of requirements in `LASTING` or, without such requirements, the middle of the envelope.
     """
-    name = asked.envelope.configuration or robot.configurations.names[0]
-    index: dict[tuple[float, ...], int] = {}
+    name = requirements.envelope.configuration or robot.configurations.names[0]
+    index_of_point: dict[tuple[float, ...], int] = {}
     envelope_points: list[EnvelopePoint] = []
 
-    def row(point: EnvelopePoint) -> int:
-        key = tuple(float(np.asarray(x)) for x in jax.tree.leaves(point))
-        if key not in index:
-            index[key] = len(envelope_points)
+    def point_index(point: EnvelopePoint) -> int:
+        coordinates = tuple(float(np.asarray(x)) for x in jax.tree.leaves(point))
+        if coordinates not in index_of_point:
+            index_of_point[coordinates] = len(envelope_points)
             envelope_points.append(point)
-        return index[key]
+        return index_of_point[coordinates]
 
     demands = []
-    for r in asked.each:
-        envelope = sheet.envelope_points(robot, r)
-        rows = [tuple(row(p) for p in corner) for corner in _envelope_corners(robot, r, envelope)]
-        demands.append((r, tuple(k for corner in dict.fromkeys(rows) for k in corner)))
-    e = asked.envelope
+    for r in requirements.each:
+        points_of_envelope = sheet.envelope_points(robot, r)
+        indices = [
+            tuple(point_index(p) for p in corner) for corner in _envelope_corners(robot, r, points_of_envelope)
+        ]
+        demands.append((r, tuple(k for corner in dict.fromkeys(indices) for k in corner)))
+    envelope = requirements.envelope
     middle_demand = Requirement("speed_m_s", 0.0, True, dataclasses.replace(
-        e, payload_kg=(sum(e.payload_kg) / 2,) * 2, slope_deg=(sum(e.slope_deg) / 2,) * 2,
-        state_of_charge=(sum(e.state_of_charge) / 2,) * 2,
-        supply_voltage_V=None if e.supply_voltage_V is None else (sum(e.supply_voltage_V) / 2,) * 2,
+        envelope, payload_kg=(sum(envelope.payload_kg) / 2,) * 2, slope_deg=(sum(envelope.slope_deg) / 2,) * 2,
+        state_of_charge=(sum(envelope.state_of_charge) / 2,) * 2,
+        supply_voltage_V=None if envelope.supply_voltage_V is None else (sum(envelope.supply_voltage_V) / 2,) * 2,
     ))  # fmt: skip
-    middle = row(jax.tree.map(lambda x: x[0], sheet.envelope_points(robot, middle_demand)))
-    travelling = tuple(sorted({k for r, rows in demands if r.name in LASTING for k in rows})) or (middle,)
+    middle = point_index(jax.tree.map(lambda x: x[0], sheet.envelope_points(robot, middle_demand)))
+    travelling = tuple(sorted({k for r, indices in demands if r.name in LASTING for k in indices})) or (middle,)
     points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *envelope_points)
     one_cell = params.without_weak_types(
         dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1))
@@ -148,120 +149,137 @@ def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -
     return SizingTask(one_cell, name, options.base_mass, points, middle, tuple(demands), travelling)
 
 
-def requirement_label(r: Requirement) -> str:
-    extra = ""
-    if r.name == "endurance_min":
-        extra = f" driving {100 * r.share:g} % of the time" if r.share else " standing still"
-    return f"{r.quantity.label}{extra}"
+def requirement_label(requirement: Requirement) -> str:
+    duty = ""
+    if requirement.name == "endurance_min":
+        duty = f" driving {100 * requirement.share:g} % of the time" if requirement.share else " standing still"
+    return f"{requirement.quantity.label}{duty}"
 
 
-def _envelope_corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[tuple[EnvelopePoint, ...]]:
+def _envelope_corners(
+    robot: Robot, requirement: Requirement, envelope: EnvelopePoint
+) -> list[tuple[EnvelopePoint, ...]]:
     """Points of a requirement, grouped by the corners of its envelope."""
-    count = len(np.asarray(at.payload))
-    points = [jax.tree.map(lambda x, k=k: x[k], at) for k in range(count)]
-    if r.name == "mass_kg" or (r.name == "endurance_min" and not r.share):
+    point_count = len(np.asarray(envelope.payload))
+    points = [jax.tree.map(lambda x, k=k: x[k], envelope) for k in range(point_count)]
+    if requirement.name == "mass_kg" or (requirement.name == "endurance_min" and not requirement.share):
         return [(points[0],)]
-    low, high = r.envelope.charge
-    ends = {SLOPE: r.envelope.slope_deg, CHARGE: (low, high)}
+    low, high = requirement.envelope.charge
+    ends = {SLOPE: requirement.envelope.slope_deg, CHARGE: (low, high)}
     corners = [
         p
         for p in points
-        if (SLOPE not in r.quantity.axes or float(p.slope_deg) in ends[SLOPE])
-        and (CHARGE not in r.quantity.axes or float(p.charge) in ends[CHARGE])
-        and float(p.payload) in r.envelope.payload_kg
+        if (SLOPE not in requirement.quantity.axes or float(p.slope_deg) in ends[SLOPE])
+        and (CHARGE not in requirement.quantity.axes or float(p.charge) in ends[CHARGE])
+        and float(p.payload) in requirement.envelope.payload_kg
     ]
-    if r.name == "slope_deg":
-        return [(dataclasses.replace(p, slope_deg=jnp.asarray(float(r.limit or 0.0))),) for p in corners]
-    if r.name == "payload_kg":
-        return [(dataclasses.replace(p, payload=jnp.asarray(float(r.limit or 0.0))),) for p in corners]
-    if r.name == "endurance_min":
+    if requirement.name == "slope_deg":
+        return [(dataclasses.replace(p, slope_deg=jnp.asarray(float(requirement.limit or 0.0))),) for p in corners]
+    if requirement.name == "payload_kg":
+        return [(dataclasses.replace(p, payload=jnp.asarray(float(requirement.limit or 0.0))),) for p in corners]
+    if requirement.name == "endurance_min":
         # Nodes of the integral, and end of the charge.
         nodes = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
-        charges = [*(high + (r.envelope.charge_end - high) * nodes), r.envelope.charge_end]
+        charges = [*(high + (requirement.envelope.charge_end - high) * nodes), requirement.envelope.charge_end]
         return [tuple(dataclasses.replace(p, charge=jnp.asarray(float(c))) for c in charges) for p in corners]
     return [(p,) for p in corners]
 
 
-def evaluate_design(asked: SizingTask, design: Design) -> tuple[Array, Array]:
+def evaluate_design(task: SizingTask, design: Design) -> tuple[Array, Array]:
     """Objectives (as in `OBJECTIVES`) and margins (as in `SizingTask.labels`) of one design. Can be traced by JAX.
 
     Margins are shares of the required or permitted value. A requirement is met if its margin is not negative.
     """
-    robot, ratings = build_robot(asked.robot, asked.base_mass, asked.configuration, design)
-    states = jax.vmap(lambda p: travel_quantities(robot, p, ratings)[0])(asked.points)
-    mass = jnp.asarray(robot.configurations[asked.configuration].mass)
-    energy = states["energy_per_metre_Wh"][asked.middle] / 3600.0
+    robot, ratings = build_robot(task.robot, task.base_mass, task.configuration, design)
+    states = jax.vmap(lambda p: travel_quantities(robot, p, ratings)[0])(task.points)
+    mass = jnp.asarray(robot.configurations[task.configuration].mass)
+    energy = states["energy_per_metre_Wh"][task.middle] / 3600.0
 
-    def at_points(rows: tuple[int, ...]) -> tuple[EnvelopePoint, dict[str, Array]]:
-        return jax.tree.map(lambda x: x[np.array(rows, int)], (asked.points, states))
+    def states_at(indices: tuple[int, ...]) -> tuple[EnvelopePoint, dict[str, Array]]:
+        return jax.tree.map(lambda x: x[np.array(indices, int)], (task.points, states))
 
-    margins = [_demand_margin(asked, r, robot, ratings, *at_points(rows)) for r, rows in asked.demands]
-    margins += _rating_margins(design, robot, *at_points(asked.travelling))
+    margins = [
+        _demand_margin(task, requirement, robot, ratings, *states_at(indices))
+        for requirement, indices in task.demands
+    ]
+    margins += _rating_margins(design, robot, *states_at(task.travelling))
     objectives = jnp.stack([mass, energy, jnp.asarray(design.drive["cost"])])
     return objectives, jnp.stack(margins)
 
 
 def _rating_margins(design: Design, robot: Robot, points: EnvelopePoint, states: Mapping[str, Array]) -> list[Array]:
     """Margins to the ratings of the parts, as in `RATED`."""
-    battery = jnp.max(jnp.where(points.battery > 0.5, states["battery"], 0.0))
+    battery_current = jnp.max(jnp.where(points.battery > 0.5, states["battery"], 0.0))
     return [
         jnp.min(_heat_margins(robot, points, states["current"], design.drive["temperature"])),
         1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_motor"],
         1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_gearbox"],
         1 - jnp.max(states["gearbox_Nm"]) / design.drive["torque"],
-        1 - battery / (jnp.exp(design.continuous[..., 2]) * design.cell["current"]),
+        1 - battery_current / (jnp.exp(design.continuous[..., 2]) * design.cell["current"]),
     ]
 
 
 def _demand_margin(
-    asked: SizingTask, r: Requirement, robot: Robot, ratings: Ratings, points: EnvelopePoint,
+    task: SizingTask, requirement: Requirement, robot: Robot, ratings: Ratings, points: EnvelopePoint,
     states: Mapping[str, Array],
 ) -> Array:  # fmt: skip
-    travels = jnp.min(jnp.minimum(states["left"], 1.0))
-    cell_voltage_ratio = jnp.min(jnp.minimum(states["cell"] / ratings.voltage_cutoff, 1.0))
-    if r.name == "mass_kg":
-        share = 1 - jnp.asarray(robot.configurations[asked.configuration].mass) / _positive_limit(r)
-        return -share if r.least else share
-    if r.name == "slope_deg":
-        return jnp.minimum(travels, cell_voltage_ratio)
-    if r.name == "payload_kg":
+    travel_margin = jnp.min(jnp.minimum(states["left"], 1.0))
+    cell_voltage_margin = jnp.min(jnp.minimum(states["cell"] / ratings.voltage_cutoff, 1.0))
+    if requirement.name == "mass_kg":
+        margin = 1 - jnp.asarray(robot.configurations[task.configuration].mass) / _positive_limit(requirement)
+        return -margin if requirement.least else margin
+    if requirement.name == "slope_deg":
+        return jnp.minimum(travel_margin, cell_voltage_margin)
+    if requirement.name == "payload_kg":
         heat_margin = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(ratings.temperature)))
-        torque = 1 - jnp.max(states["gearbox_Nm"]) / ratings.torque
-        return jnp.min(jnp.stack([travels, cell_voltage_ratio, heat_margin, torque]))
-    if r.name == "endurance_min":
-        return _endurance_margin(r, robot, ratings, states)
-    if r.limit is None:  # ratings of the parts, required of every design
-        return jnp.minimum(travels, cell_voltage_ratio)
-    if r.name not in states:  # not a quantity of straight travel
-        value, outcome = jax.vmap(lambda p: requirement(robot, p, ratings, r.name))(points)
-        value, travels = value / r.quantity.factor, jnp.min(jnp.where(outcome == CONVERGED, 1.0, -1.0))
+        torque_margin = 1 - jnp.max(states["gearbox_Nm"]) / ratings.torque
+        return jnp.min(jnp.stack([travel_margin, cell_voltage_margin, heat_margin, torque_margin]))
+    if requirement.name == "endurance_min":
+        return _endurance_margin(requirement, robot, ratings, states)
+    if requirement.limit is None:  # ratings of the parts, required of every design
+        return jnp.minimum(travel_margin, cell_voltage_margin)
+    if requirement.name not in states:  # not a quantity of straight travel
+        value, outcome = jax.vmap(lambda p: evaluate_requirement(robot, p, ratings, requirement.name))(points)
+        value = value / requirement.quantity.factor
+        travel_margin = jnp.min(jnp.where(outcome == CONVERGED, 1.0, -1.0))
     else:
-        value = states[r.name] / r.quantity.factor
-    share = jnp.min(value / _positive_limit(r) - 1) if r.least else jnp.min(1 - value / _positive_limit(r))
-    if r.name == "winding_C":
-        share = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(_positive_limit(r))))
-    return jnp.min(jnp.stack([share, travels, cell_voltage_ratio]))
+        value = states[requirement.name] / requirement.quantity.factor
+    margin = (
+        jnp.min(value / _positive_limit(requirement) - 1)
+        if requirement.least
+        else jnp.min(1 - value / _positive_limit(requirement))
+    )
+    if requirement.name == "winding_C":
+        margin = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(_positive_limit(requirement))))
+    return jnp.min(jnp.stack([margin, travel_margin, cell_voltage_margin]))
 
 
-def _positive_limit(r: Requirement) -> float:
-    return max(float(r.limit or 0.0), 1e-9)
+def _positive_limit(requirement: Requirement) -> float:
+    return max(float(requirement.limit or 0.0), 1e-9)
 
 
 def _heat_margins(robot: Robot, points: EnvelopePoint, current: Array, limit: Array) -> Array:
     return jax.vmap(lambda p, i: jnp.asarray(thermal_margin(robot, p, i, limit)))(points, current)
 
 
-def _endurance_margin(r: Requirement, robot: Robot, ratings: Ratings, at: Mapping[str, Array]) -> Array:
+def _endurance_margin(requirement: Requirement, robot: Robot, ratings: Ratings, states: Mapping[str, Array]) -> Array:
     """Margin of the time until the charge ends, or until the cells reach their cut-off voltage."""
     battery = robot.battery
-    capacity_used = battery.capacity * (r.envelope.charge[1] - r.envelope.charge_end)
-    limit = r.quantity.factor * _positive_limit(r)
-    if not r.share:
-        end = battery.voltage_cell(0.0, battery.capacity * (1 - r.envelope.charge_end)) / ratings.voltage_cutoff - 1
-        return jnp.minimum(capacity_used / battery.current(0.0) / limit - 1, end)
+    capacity_used = battery.capacity * (requirement.envelope.charge[1] - requirement.envelope.charge_end)
+    limit = requirement.quantity.factor * _positive_limit(requirement)
+    if not requirement.share:
+        end_margin = (
+            battery.voltage_cell(0.0, battery.capacity * (1 - requirement.envelope.charge_end))
+            / ratings.voltage_cutoff
+            - 1
+        )
+        return jnp.minimum(capacity_used / battery.current(0.0) / limit - 1, end_margin)
     weights = jnp.asarray(np.polynomial.legendre.leggauss(NODES)[1] / 2)
-    motors = (at["battery"] - battery.current_other) * r.share
-    current = jnp.asarray(battery.current(motors)).reshape(-1, NODES + 1)
-    time = capacity_used * jnp.sum(weights / current[:, :NODES], axis=1)
-    travels, cell_voltage_ratio = jnp.min(jnp.minimum(at["left"], 1.0)), jnp.min(at["cell"] / ratings.voltage_cutoff)
-    return jnp.min(jnp.stack([jnp.min(time) / limit - 1, travels, cell_voltage_ratio]))
+    motor_current = (states["battery"] - battery.current_other) * requirement.share
+    battery_current = jnp.asarray(battery.current(motor_current)).reshape(-1, NODES + 1)
+    time = capacity_used * jnp.sum(weights / battery_current[:, :NODES], axis=1)
+    travel_margin, cell_voltage_margin = (
+        jnp.min(jnp.minimum(states["left"], 1.0)),
+        jnp.min(states["cell"] / ratings.voltage_cutoff),
+    )
+    return jnp.min(jnp.stack([jnp.min(time) / limit - 1, travel_margin, cell_voltage_margin]))

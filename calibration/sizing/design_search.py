@@ -59,7 +59,7 @@ BINDS = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class SizedDesign:
-    """One design that the search found.
+    """A design from the search, with its objectives, margins and robot.
 
     Attributes:
         drive, cell: data sheets of drive and cell.
@@ -132,9 +132,9 @@ class SizingResult:
 
 
 @compiled
-def _evaluate_designs(problem: SizingTask, designs: Design) -> tuple[Array, Array]:
+def _evaluate_designs(task: SizingTask, designs: Design) -> tuple[Array, Array]:
     """Objectives, shape (designs, objectives), and margins, shape (designs, margins)."""
-    return jax.vmap(lambda d: evaluate_design(problem, d))(designs)
+    return jax.vmap(lambda d: evaluate_design(task, d))(designs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,12 +164,12 @@ class ChoiceSpace:
         )
 
 
-def enumerate_choices(robot: Robot, problem: SizingTask, options: PartOptions) -> ChoiceSpace:
+def enumerate_choices(robot: Robot, task: SizingTask, options: PartOptions) -> ChoiceSpace:
     """All choices of parts for a robot."""
     n_drives, n_cells = len(options.drives), len(options.cells)
-    choices = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
-    drive, cell, series = (np.array(x) for x in zip(*choices, strict=True))
-    radius = float(robot.configurations[problem.configuration].radius)
+    combinations = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
+    drive, cell, series = (np.array(x) for x in zip(*combinations, strict=True))
+    radius = float(robot.configurations[task.configuration].radius)
 
     def bounds(k: int, ratio: str) -> np.ndarray:
         return np.log(
@@ -187,13 +187,13 @@ def enumerate_choices(robot: Robot, problem: SizingTask, options: PartOptions) -
 
 
 def evaluate_designs(
-    problem: SizingTask, choice: ChoiceSpace, rows: np.ndarray, x: np.ndarray
+    task: SizingTask, choices: ChoiceSpace, rows: np.ndarray, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Objectives and margins of many designs, computed in calls of one size."""
     parts = []
     for first in range(0, len(rows), ROWS):
-        some = np.minimum(np.arange(first, first + ROWS), len(rows) - 1)
-        f, g = jax.device_get(_evaluate_designs(problem, choice.designs(rows[some], x[some])))
+        batch = np.minimum(np.arange(first, first + ROWS), len(rows) - 1)
+        f, g = jax.device_get(_evaluate_designs(task, choices.designs(rows[batch], x[batch])))
         parts.append((f[: len(rows) - first], g[: len(rows) - first]))
     f, g = (np.concatenate(p) for p in zip(*parts, strict=True))
     f = np.where(f > 0, f, np.inf)  # worse than any other: no motion, or no price
@@ -202,7 +202,7 @@ def evaluate_designs(
 
 def size_robot(
     robot: Robot,
-    asked: Requirements,
+    requirements: Requirements,
     objectives: Names,
     *,
     motors: Names = (),
@@ -222,63 +222,73 @@ def size_robot(
     """
     for name in objectives:
         stated_word(name, OBJECTIVES, "objective")
-    sheet.reject_impossible(robot, asked)
+    sheet.reject_impossible(robot, requirements)
     part_options = options_for_robot(robot, motors)
-    problem = build_sizing_task(robot, asked, part_options)
-    choice = enumerate_choices(robot, problem, part_options)
-    columns = [list(OBJECTIVES).index(name) for name in objectives]
+    task = build_sizing_task(robot, requirements, part_options)
+    choices = enumerate_choices(robot, task, part_options)
+    objective_columns = [list(OBJECTIVES).index(name) for name in objectives]
     tell(progress_remark("designs"))
-    drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
-    is_feasible = drawn.g.max(axis=0) >= 0
-    unmeetable = tuple(label for label, k in zip(problem.labels, is_feasible, strict=True) if not k)
-    first = np.eye(len(OBJECTIVES))[columns[0]]
+    random_designs = _random_designs(task, choices, "cost" in objectives, np.random.default_rng(seed))
+    meetable = random_designs.g.max(axis=0) >= 0
+    unmeetable = tuple(label for label, k in zip(task.labels, meetable, strict=True) if not k)
+    first_weights = np.eye(len(OBJECTIVES))[objective_columns[0]]
 
-    def refined(designs: _EvaluatedDesigns, weights: np.ndarray, free: Names, along: int) -> _EvaluatedDesigns:
-        return _refine_designs(problem, choice, designs, is_feasible, weights, free, along)
+    def refined(
+        designs: _EvaluatedDesigns, weights: np.ndarray, free: Names, points_per_axis: int
+    ) -> _EvaluatedDesigns:
+        return _refine_designs(task, choices, designs, meetable, weights, free, points_per_axis)
 
-    def best_of(designs: _EvaluatedDesigns, count: int, weights: np.ndarray) -> np.ndarray:
-        return np.argsort(_cost(designs.f, designs.g, is_feasible, weights))[:count]
+    def lowest_costs(designs: _EvaluatedDesigns, count: int, weights: np.ndarray) -> np.ndarray:
+        return np.argsort(_cost(designs.f, designs.g, meetable, weights))[:count]
 
     tell(progress_remark("whole"))
-    tried = _catalogue_designs(problem, choice, _promising_choices(drawn, is_feasible, columns))
-    shares = SHARES if len(columns) == 2 else SHARES[:1]
-    weights = np.outer(1 - shares, first) + np.outer(shares, np.eye(len(OBJECTIVES))[columns[-1]])
-    best = np.concatenate([best_of(tried, KEPT_WHOLE, w) for w in weights])
-    of_best = np.repeat(weights, len(best) // len(weights), axis=0)
-    buildable = refined(tried.part(best), of_best, ("radius",), POINTS_PER_AXIS)
+    catalogue = _catalogue_designs(task, choices, _promising_choices(random_designs, meetable, objective_columns))
+    shares = SHARES if len(objective_columns) == 2 else SHARES[:1]
+    weights = np.outer(1 - shares, first_weights) + np.outer(shares, np.eye(len(OBJECTIVES))[objective_columns[-1]])
+    best = np.concatenate([lowest_costs(catalogue, KEPT_WHOLE, w) for w in weights])
+    best_weights = np.repeat(weights, len(best) // len(weights), axis=0)
+    buildable = refined(catalogue.part(best), best_weights, ("radius",), POINTS_PER_AXIS)
     tell(progress_remark("refined", REFINED))
-    by_cost = best_of(drawn, len(drawn.rows), first)
-    motors_of_choices = np.array([part_options.drives[k].motor.name for k in choice.drive])
-    best_choices = np.sort(np.unique(drawn.rows[by_cost], return_index=True)[1])[:COARSE]
-    of_motors = np.unique(motors_of_choices[drawn.rows[by_cost]], return_index=True)[1]
-    coarse = refined(drawn.part(by_cost[np.union1d(best_choices, of_motors)]), first, CONTINUOUS, 3)
-    free = coarse.part(best_of(coarse, REFINED // 2, first)) + buildable.part(best_of(buildable, REFINED // 2, first))
-    free = refined(free, first, CONTINUOUS, POINTS_PER_AXIS)
-    evaluated = sum(d.evaluated for d in (drawn, tried, buildable, coarse, free))
+    cost_order = lowest_costs(random_designs, len(random_designs.rows), first_weights)
+    motor_of_choice = np.array([part_options.drives[k].motor.name for k in choices.drive])
+    best_choices = np.sort(np.unique(random_designs.rows[cost_order], return_index=True)[1])[:COARSE]
+    best_of_motors = np.unique(motor_of_choice[random_designs.rows[cost_order]], return_index=True)[1]
+    coarse_designs = refined(
+        random_designs.part(cost_order[np.union1d(best_choices, best_of_motors)]), first_weights, CONTINUOUS, 3
+    )
+    start_designs = coarse_designs.part(lowest_costs(coarse_designs, REFINED // 2, first_weights)) + buildable.part(
+        lowest_costs(buildable, REFINED // 2, first_weights)
+    )
+    ideal_designs = refined(start_designs, first_weights, CONTINUOUS, POINTS_PER_AXIS)
+    evaluated = sum(d.evaluated for d in (random_designs, catalogue, buildable, coarse_designs, ideal_designs))
 
     def sized(designs: _EvaluatedDesigns, k: int) -> SizedDesign:
-        margins = np.where(is_feasible, designs.g[k], np.nan)
-        return _sized_design(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
+        margins = np.where(meetable, designs.g[k], np.nan)
+        return _sized_design(robot, task, choices, designs.rows[k], designs.x[k], designs.f[k], margins)
 
-    ranked = [(c, d, k) for d in (free, buildable, coarse) for k, c in enumerate(_cost(d.f, d.g, is_feasible, first))]
-    by_motor = dict[str, SizedDesign]()
+    ranked = [
+        (c, d, k)
+        for d in (ideal_designs, buildable, coarse_designs)
+        for k, c in enumerate(_cost(d.f, d.g, meetable, first_weights))
+    ]
+    best_by_motor = dict[str, SizedDesign]()
     for _, designs, k in sorted(ranked, key=lambda c: c[0]):
-        name = str(motors_of_choices[designs.rows[k]])
-        if name not in by_motor:  # building robots for all thousand designs takes time
-            by_motor[name] = sized(designs, k)
-    order = best_of(buildable, len(buildable.rows), first)
-    good = [int(k) for k in order if np.all(buildable.g[k][is_feasible] >= 0)]
-    different: dict[tuple[int, int], int] = {}
-    for k in good:
+        name = str(motor_of_choice[designs.rows[k]])
+        if name not in best_by_motor:  # building robots for all thousand designs takes time
+            best_by_motor[name] = sized(designs, k)
+    order = lowest_costs(buildable, len(buildable.rows), first_weights)
+    feasible = [int(k) for k in order if np.all(buildable.g[k][meetable] >= 0)]
+    best_of_parts: dict[tuple[int, int], int] = {}
+    for k in feasible:
         row = buildable.rows[k]
-        different.setdefault((int(choice.drive[row]), int(choice.cell[row])), k)
-    designs_found = [sized(buildable, k) for k in list(different.values())[:8]]
-    ideal = best_of(free, 1, first)[0]
-    front = _pareto_front(buildable.f[:, columns], good) if len(columns) == 2 else []
+        best_of_parts.setdefault((int(choices.drive[row]), int(choices.cell[row])), k)
+    best_designs = [sized(buildable, k) for k in list(best_of_parts.values())[:8]]
+    ideal_index = lowest_costs(ideal_designs, 1, first_weights)[0]
+    front = _pareto_front(buildable.f[:, objective_columns], feasible) if len(objective_columns) == 2 else []
     return SizingResult(
-        problem, part_options, objectives[0], unmeetable,
-        sized(free, ideal) if np.all(free.g[ideal][is_feasible] >= 0) else None,
-        designs_found[0] if designs_found else None, tuple(designs_found[1:]), by_motor,
+        task, part_options, objectives[0], unmeetable,
+        sized(ideal_designs, ideal_index) if np.all(ideal_designs.g[ideal_index][meetable] >= 0) else None,
+        best_designs[0] if best_designs else None, tuple(best_designs[1:]), best_by_motor,
         tuple(sized(buildable, k) for k in front), evaluated,
     )  # fmt: skip
 
@@ -313,72 +323,79 @@ class _EvaluatedDesigns:
 
 
 def _random_designs(
-    problem: SizingTask, choice: ChoiceSpace, costed: bool, rng: np.random.Generator
+    task: SizingTask, choices: ChoiceSpace, priced: bool, rng: np.random.Generator
 ) -> _EvaluatedDesigns:
-    """Random designs for every choice of parts. They show which limits can be met, and which choices are promising.
+    """Random designs for every choice of parts. They reveal limits that can be met, and promising choices.
 
     Args:
-        costed: True to include only drives with a known price.
+        priced: True to include only drives with a known price.
     """
-    rows = np.repeat(np.arange(len(choice.drive)), TRIES)
-    if costed:
-        rows = rows[np.isfinite(choice.options.drive["cost"][choice.drive[rows]])]
-    low, high = choice.low[rows], choice.high[rows]
+    rows = np.repeat(np.arange(len(choices.drive)), TRIES)
+    if priced:
+        rows = rows[np.isfinite(choices.options.drive["cost"][choices.drive[rows]])]
+    low, high = choices.low[rows], choices.high[rows]
     x = low + (high - low) * rng.random((len(rows), 3)) ** np.array([1.0, 1.0, 2.0])
-    return _EvaluatedDesigns(rows, x, *evaluate_designs(problem, choice, rows, x), len(rows))
+    return _EvaluatedDesigns(rows, x, *evaluate_designs(task, choices, rows, x), len(rows))
 
 
-def _promising_choices(drawn: _EvaluatedDesigns, kept: np.ndarray, columns: list[int]) -> np.ndarray:
+def _promising_choices(
+    random_designs: _EvaluatedDesigns, meetable: np.ndarray, objective_columns: list[int]
+) -> np.ndarray:
     """Choices of parts whose random designs come nearest to each objective and the limits that can be met."""
-    misses = 5 * np.sum(np.maximum(-drawn.g[:, kept], 0.0), axis=1)
-    order = [drawn.rows[np.argsort(np.log(drawn.f[:, c]) + misses)] for c in columns]
-    return np.unique(np.concatenate([list(dict.fromkeys(rows))[:WHOLE] for rows in order]))
+    shortfall = 5 * np.sum(np.maximum(-random_designs.g[:, meetable], 0.0), axis=1)
+    ranked_rows = [
+        random_designs.rows[np.argsort(np.log(random_designs.f[:, c]) + shortfall)] for c in objective_columns
+    ]
+    return np.unique(np.concatenate([list(dict.fromkeys(rows))[:WHOLE] for rows in ranked_rows]))
 
 
-def _catalogue_designs(problem: SizingTask, choice: ChoiceSpace, rows: np.ndarray) -> _EvaluatedDesigns:
+def _catalogue_designs(task: SizingTask, choices: ChoiceSpace, rows: np.ndarray) -> _EvaluatedDesigns:
     """Designs of each choice of parts: every gear ratio of its sheets, a few whole cells in parallel, three radii."""
-    choice_rows, x = [], []
-    for row in rows:
-        low, high = choice.low[row, 1], choice.high[row, 1]
-        ratios = choice.options.drives[choice.drive[row]].ratios
-        for ratio, p, share in itertools.product(ratios, range(1, MOST_WHOLE + 1), (0.4, 0.7, 1.0)):
-            choice_rows.append(row)
-            x.append([math.log(ratio), low + share * (high - low), math.log(p)])
-    rows, numbers = np.array(choice_rows), np.array(x)
-    return _EvaluatedDesigns(rows, numbers, *evaluate_designs(problem, choice, rows, numbers), len(rows))
+    choice_rows, numbers = [], []
+    for choice in rows:
+        low, high = choices.low[choice, 1], choices.high[choice, 1]
+        ratios = choices.options.drives[choices.drive[choice]].ratios
+        for ratio, parallel, radius_share in itertools.product(ratios, range(1, MOST_WHOLE + 1), (0.4, 0.7, 1.0)):
+            choice_rows.append(choice)
+            numbers.append([math.log(ratio), low + radius_share * (high - low), math.log(parallel)])
+    rows, points = np.array(choice_rows), np.array(numbers)
+    return _EvaluatedDesigns(rows, points, *evaluate_designs(task, choices, rows, points), len(rows))
 
 
 def _refine_designs(
-    problem: SizingTask, choice: ChoiceSpace, designs: _EvaluatedDesigns, kept: np.ndarray, weights: np.ndarray,
-    free: Names, along: int,
+    task: SizingTask, choices: ChoiceSpace, designs: _EvaluatedDesigns, meetable: np.ndarray, weights: np.ndarray,
+    free: Names, points_per_axis: int,
 ) -> _EvaluatedDesigns:  # fmt: skip
-    """Best designs in shrinking boxes around the given ones.
+    """Best designs in shrinking boxes around these designs.
 
     Args:
-        kept: True for limits that at least one design meets.
+        meetable: True for limits that at least one design meets.
         weights: weights of the objectives, of all designs or of each.
         free: the numbers of `CONTINUOUS` that may move.
-        along: number of points along each axis of a box.
+        points_per_axis: number of points along each axis of a box.
     """
-    axes = [np.linspace(-WIDTH, WIDTH, along) if name in free else np.zeros(1) for name in CONTINUOUS]
+    axes = [np.linspace(-WIDTH, WIDTH, points_per_axis) if name in free else np.zeros(1) for name in CONTINUOUS]
     box = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    count, n, x = len(designs.rows), len(box), designs.x
+    count = len(designs.rows)
+    n = len(box)
+    x = designs.x
     rows = np.repeat(designs.rows, n)
     weights = np.repeat(np.broadcast_to(weights, (count, len(OBJECTIVES))), n, axis=0)
     for _ in range(ROUNDS):
-        candidates = np.clip((x[:, None] + box).reshape(-1, 3), choice.low[rows], choice.high[rows])
-        f, g = evaluate_designs(problem, choice, rows, candidates)
-        cost = _cost(f, g, kept, weights).reshape(count, n)
+        candidates = np.clip((x[:, None] + box).reshape(-1, 3), choices.low[rows], choices.high[rows])
+        f, g = evaluate_designs(task, choices, rows, candidates)
+        cost = _cost(f, g, meetable, weights).reshape(count, n)
         best = np.arange(count) * n + np.argmin(cost, axis=1)
-        x, box = candidates[best], box * SHRINK
+        x = candidates[best]
+        box = box * SHRINK
     return _EvaluatedDesigns(designs.rows, x, f[best], g[best], ROUNDS * len(rows))
 
 
-def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _cost(f: np.ndarray, g: np.ndarray, meetable: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Cost of designs: logarithm of the objective. Designs with a violated margin cost more than any feasible one."""
     value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
-    short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
-    return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)
+    shortfall = np.sum(np.maximum(-g[:, meetable], 0.0), axis=1)
+    return np.where(np.isfinite(value), value + np.where(shortfall > 0, 100 + shortfall, 0.0), 1e6)
 
 
 def _pareto_front(f: np.ndarray, among: list[int]) -> list[int]:
@@ -392,37 +409,40 @@ def _pareto_front(f: np.ndarray, among: list[int]) -> list[int]:
 
 
 def _sized_design(
-    robot: Robot, problem: SizingTask, choice: ChoiceSpace, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray
+    robot: Robot, task: SizingTask, choices: ChoiceSpace, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray
 ) -> SizedDesign:
-    drive, cell = choice.options.drives[choice.drive[row]], choice.options.cells[choice.cell[row]]
-    series = int(choice.in_series[row])
+    drive, cell = choices.options.drives[choices.drive[row]], choices.options.cells[choices.cell[row]]
+    in_series = int(choices.in_series[row])
     ratio, radius, parallel = (float(v) for v in np.exp(x))
-    design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x[None]))
-    made, _ = build_robot(problem.robot, problem.base_mass, problem.configuration, design)
-    made = jax.tree.map(lambda v: np.asarray(v) if eqx.is_array(v) else v, made)
+    design = jax.tree.map(lambda v: v[0], choices.designs(np.array([row]), x[None]))
+    sized_robot, _ = build_robot(task.robot, task.base_mass, task.configuration, design)
+    sized_robot = jax.tree.map(lambda v: np.asarray(v) if eqx.is_array(v) else v, sized_robot)
 
-    def rated(key: str) -> float:
-        return float(choice.options.drive[key][choice.drive[row]])
+    def rating(key: str) -> float:
+        return float(choices.options.drive[key][choices.drive[row]])
 
-    made = dataclasses.replace(
-        made,
+    sized_robot = dataclasses.replace(
+        sized_robot,
         battery=dataclasses.replace(
-            made.battery, cells=series, voltage_cutoff=float(choice.options.cell["cutoff"][choice.cell[row]]),
+            sized_robot.battery, cells=in_series,
+            voltage_cutoff=float(choices.options.cell["cutoff"][choices.cell[row]]),
             current_limit=parallel * limit if math.isfinite(limit := cell.max_continuous_current) else None,
         ),
         motor=dataclasses.replace(
-            made.motor, speed_limit=rated("speed_motor"), temperature_limit=rated("temperature")
+            sized_robot.motor, speed_limit=rating("speed_motor"), temperature_limit=rating("temperature")
         ),
         gearbox=dataclasses.replace(
-            made.gearbox, speed_limit=rated("speed_gearbox"), torque_limit=rated("torque")
+            sized_robot.gearbox, speed_limit=rating("speed_gearbox"), torque_limit=rating("torque")
         ),
     )  # fmt: skip
-    margins = {label: float(v) for label, v in zip(problem.labels, g, strict=True) if np.isfinite(v)}
-    at_bound = tuple(
+    margins = {label: float(v) for label, v in zip(task.labels, g, strict=True) if np.isfinite(v)}
+    reached_bounds = tuple(
         f"{word} {name}"
-        for word, bound in (("least", choice.low[row]), ("largest", choice.high[row]))
+        for word, bound in (("least", choices.low[row]), ("largest", choices.high[row]))
         for name, v, b in zip(CONTINUOUS, x, bound, strict=True)
         if abs(v - b) < 1e-6 and (word, name) != ("least", "parallel")
     )
-    values = {name: float(v) for name, v in zip(OBJECTIVES, f, strict=True) if np.isfinite(v)}
-    return SizedDesign(drive, cell, ratio, radius, series, parallel, values, margins, at_bound, made)
+    objectives = {name: float(v) for name, v in zip(OBJECTIVES, f, strict=True) if np.isfinite(v)}
+    return SizedDesign(
+        drive, cell, ratio, radius, in_series, parallel, objectives, margins, reached_bounds, sized_robot
+    )

@@ -35,27 +35,26 @@ UNITS = {
     **dict.fromkeys(("g", "mA", "mH", "mNm", "mNm_per_A", "mohm"), 1e-3),
     "gcm2": 1e-7, "mAh": COULOMB_PER_MAH, "percent": 1e-2, "rpm": RPM, "rpm_per_V": RPM,
 }  # fmt: skip
-#: Columns of numbers without a unit, and of several names in a cell.
-PLAIN, LISTED = ("cells", "ratio", "stages"), "gearboxes"
+#: Columns of numbers without a unit, and the column whose cells list several names.
+UNITLESS_COLUMNS = ("cells", "ratio", "stages")
+LIST_COLUMN = "gearboxes"
 #: A data sheet: values by the names of its columns, without their units.
 Sheet = types.SimpleNamespace
 
 
 def _value_in_si(column: str, text: str) -> tuple[str, Any]:
     """Name of a column without its unit, and the value of a cell in SI. NaN for a number that is missing."""
-    if column == LISTED:
+    if column == LIST_COLUMN:
         return column, tuple(part.strip() for part in text.split(";") if part.strip())
     unit = max((u for u in UNITS if column.endswith(f"_{u}")), key=len, default="")
-    if not unit and column not in PLAIN:
+    if not unit and column not in UNITLESS_COLUMNS:
         return column, text
     return column.removesuffix(f"_{unit}"), float(Fraction(text)) * UNITS.get(unit, 1.0) if text else math.nan
 
 
 @functools.cache
 def packaged_sheets(table: str) -> tuple[Sheet, ...]:
-    """Data sheets of a packaged table, `motors`, `gearboxes` or `cells`, in its order. The first cell is the
-    paper's.
-    """
+    """Data sheets of a packaged table: `motors`, `gearboxes` or `cells`. The first cell is that of the paper."""
     text = (resources.files("calibration") / "data" / "parts" / f"{table}.csv").read_text("utf-8")
     return tuple(
         Sheet(**dict(itertools.starmap(_value_in_si, row.items())))
@@ -68,7 +67,7 @@ MOTOR, GEARBOX, CELL = "RE 30 24 V", "GP 32 C 23:1", "XP2200SL"
 #: Ratio of the belt stage between gearbox and driving wheel, which is not changed (docs/explanation/paper-notes.md).
 BELT_STAGE = 25 / 12
 #: Current above any limit [A].
-FREE = 1e9
+NO_LIMIT = 1e9
 
 
 class DriveOption(NamedTuple):
@@ -101,16 +100,16 @@ def drive_options(names: Names) -> tuple[DriveOption, ...]:
             continue
         for family in motor.gearboxes:
             for stages in sorted({g.stages for g in packaged_sheets("gearboxes") if g.family == family}):
-                ranked = sorted(
+                by_ratio = sorted(
                     (g for g in packaged_sheets("gearboxes") if (g.family, g.stages) == (family, stages)),
                     key=lambda g: g.ratio,
                 )
-                ratios = tuple(BELT_STAGE * g.ratio for g in ranked)
-                options.append(DriveOption(motor, family, int(stages), ratios, ranked[0]))
+                ratios = tuple(BELT_STAGE * g.ratio for g in by_ratio)
+                options.append(DriveOption(motor, family, int(stages), ratios, by_ratio[0]))
     return tuple(options)
 
 
-_LIPO = "lithium-polymer"
+_LITHIUM_POLYMER = "lithium-polymer"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,8 +129,8 @@ class PartOptions:
     base_mass: float
 
 
-def _stated(value: float, otherwise: float) -> float:
-    return otherwise if math.isnan(value) else value
+def _value_or_default(value: float, default: float) -> float:
+    return default if math.isnan(value) else value
 
 
 def options_for_robot(robot: Robot, names: Names = ()) -> PartOptions:
@@ -141,58 +140,61 @@ def options_for_robot(robot: Robot, names: Names = ()) -> PartOptions:
         robot: robot whose friction, efficiencies and cells replace values that data sheets lack.
         names: names of motors, empty for all.
     """
-    motor_options, packs = (
-        drive_options(names),
-        tuple(
-            c
-            for c in packaged_sheets("cells")
-            if c.cells == 1 and (c.name == CELL or not math.isnan(c.cut_off_voltage))
-        ),
+    drives = drive_options(names)
+    cells = tuple(
+        cell
+        for cell in packaged_sheets("cells")
+        if cell.cells == 1 and (cell.name == CELL or not math.isnan(cell.cut_off_voltage))
     )
-    paper_motor = next(m for m in packaged_sheets("motors") if m.name == MOTOR)
-    paper_gear = next(g for g in packaged_sheets("gearboxes") if g.name == GEARBOX)
-    paper_cell = next(c for c in packaged_sheets("cells") if c.name == CELL)
-    sides, battery = float(robot.sides), robot.battery
-    idle = paper_motor.torque_constant * paper_motor.no_load_current
-    rows = []
-    for d in motor_options:
-        m, g = d.motor, d.gearbox
-        share = m.torque_constant * m.no_load_current / idle
-        rows.append(
+    paper_motor = next(motor for motor in packaged_sheets("motors") if motor.name == MOTOR)
+    paper_gearbox = next(gearbox for gearbox in packaged_sheets("gearboxes") if gearbox.name == GEARBOX)
+    paper_cell = next(cell for cell in packaged_sheets("cells") if cell.name == CELL)
+    sides = float(robot.sides)
+    battery = robot.battery
+    no_load_torque = paper_motor.torque_constant * paper_motor.no_load_current
+    drive_rows = []
+    for drive in drives:
+        motor, gearbox = drive.motor, drive.gearbox
+        friction_ratio = motor.torque_constant * motor.no_load_current / no_load_torque
+        drive_rows.append(
             {
-                "resistance": m.terminal_resistance, "torque_constant": m.torque_constant,
-                "friction_coulomb": float(robot.motor.friction_coulomb) * share,
-                "friction_viscous": float(robot.motor.friction_viscous) * share,
-                "inertia": m.rotor_inertia, "inductance": m.terminal_inductance,
-                "resistance_thermal_winding": m.thermal_resistance_winding_housing,
-                "resistance_thermal_housing": m.thermal_resistance_housing_ambient,
-                "efficiency": float(robot.gearbox.efficiency_load) * g.max_efficiency / paper_gear.max_efficiency,
-                "mass": sides * (m.weight + g.weight), "cost": sides * (m.price + g.price),
-                "temperature": _stated(m.max_winding_temperature, robot.motor.temperature_limit),
-                "speed_motor": _stated(m.max_speed, robot.motor.speed_limit),
-                "speed_gearbox": _stated(g.max_continuous_input_speed, robot.gearbox.speed_limit),
-                "torque": g.max_continuous_torque * BELT_STAGE,
-                "ratio_least": d.ratios[0], "ratio_most": d.ratios[-1],
+                "resistance": motor.terminal_resistance, "torque_constant": motor.torque_constant,
+                "friction_coulomb": float(robot.motor.friction_coulomb) * friction_ratio,
+                "friction_viscous": float(robot.motor.friction_viscous) * friction_ratio,
+                "inertia": motor.rotor_inertia, "inductance": motor.terminal_inductance,
+                "resistance_thermal_winding": motor.thermal_resistance_winding_housing,
+                "resistance_thermal_housing": motor.thermal_resistance_housing_ambient,
+                "efficiency": (
+                    float(robot.gearbox.efficiency_load) * gearbox.max_efficiency / paper_gearbox.max_efficiency
+                ),
+                "mass": sides * (motor.weight + gearbox.weight), "cost": sides * (motor.price + gearbox.price),
+                "temperature": _value_or_default(motor.max_winding_temperature, robot.motor.temperature_limit),
+                "speed_motor": _value_or_default(motor.max_speed, robot.motor.speed_limit),
+                "speed_gearbox": _value_or_default(gearbox.max_continuous_input_speed, robot.gearbox.speed_limit),
+                "torque": gearbox.max_continuous_torque * BELT_STAGE,
+                "ratio_least": drive.ratios[0], "ratio_most": drive.ratios[-1],
             }
         )  # fmt: skip
-    per_charge = next(
-        c.weight / (c.cells * c.capacity)
-        for c in packaged_sheets("cells")
-        if not math.isnan(c.weight) and c.chemistry == _LIPO
+    mass_per_charge = next(
+        cell.weight / (cell.cells * cell.capacity)
+        for cell in packaged_sheets("cells")
+        if not math.isnan(cell.weight) and cell.chemistry == _LITHIUM_POLYMER
     )
-    resistance = float(battery.resistance) * paper_cell.capacity
-    columns = [
+    resistance_times_capacity = float(battery.resistance) * paper_cell.capacity
+    cell_rows = [
         {
-            "capacity": c.capacity, "voltage_full": c.full_voltage,
-            "cutoff": _stated(c.cut_off_voltage, battery.voltage_cutoff),
-            "resistance": _stated(c.resistance, resistance / c.capacity),
-            "mass": _stated(c.weight, per_charge * c.capacity),
-            "current": _stated(c.max_continuous_current, FREE),
+            "capacity": cell.capacity, "voltage_full": cell.full_voltage,
+            "cutoff": _value_or_default(cell.cut_off_voltage, battery.voltage_cutoff),
+            "resistance": _value_or_default(cell.resistance, resistance_times_capacity / cell.capacity),
+            "mass": _value_or_default(cell.weight, mass_per_charge * cell.capacity),
+            "current": _value_or_default(cell.max_continuous_current, NO_LIMIT),
         }
-        for c in packs
+        for cell in cells
     ]  # fmt: skip
-    base = sides * (paper_motor.weight + paper_gear.weight) + battery.cells * per_charge * float(battery.capacity)
-    return PartOptions(motor_options, packs, _columns(rows), _columns(columns), base)
+    base_mass = sides * (paper_motor.weight + paper_gearbox.weight) + battery.cells * mass_per_charge * float(
+        battery.capacity
+    )
+    return PartOptions(drives, cells, _columns(drive_rows), _columns(cell_rows), base_mass)
 
 
 def _columns(rows: list[dict[str, float]]) -> Columns:

@@ -96,7 +96,7 @@ class RequirementOutcome:
         return self.margin is not None and self.margin >= 0
 
 
-def fill_in_ratings(robot: Robot, asked: Requirements) -> Requirements:
+def fill_in_ratings(robot: Robot, requirements: Requirements) -> Requirements:
     """Requirements in which missing limits are replaced by the robot's own ratings.
 
     Raises:
@@ -106,44 +106,48 @@ def fill_in_ratings(robot: Robot, asked: Requirements) -> Requirements:
         "winding_C": robot.motor.temperature_limit, "motor_speed_rpm": robot.motor.speed_limit,
         "gearbox_speed_rpm": robot.gearbox.speed_limit, "gearbox_Nm": robot.gearbox.torque_limit,
     }  # fmt: skip
-    filled_ratings = []
-    for r in asked.each:
-        limit = r.limit
+    filled = []
+    for requirement in requirements.each:
+        limit = requirement.limit
         if limit is None:
-            rating = ratings_by_name[r.name]
+            rating = ratings_by_name[requirement.name]
             if rating is None:
-                raise BadConfiguration(f"{asked.source}, {r.name}: the robot states no rating; state a number")
-            limit = rating / r.quantity.factor
-        filled_ratings.append(dataclasses.replace(r, limit=limit))
-    return dataclasses.replace(asked, each=tuple(filled_ratings))
+                raise BadConfiguration(
+                    f"{requirements.source}, {requirement.name}: the robot states no rating; state a number"
+                )
+            limit = rating / requirement.quantity.factor
+        filled.append(dataclasses.replace(requirement, limit=limit))
+    return dataclasses.replace(requirements, each=tuple(filled))
 
 
-def reject_impossible(robot: Robot, asked: Requirements) -> None:
+def reject_impossible(robot: Robot, requirements: Requirements) -> None:
     """Rejects requirements that cannot be evaluated for this robot.
 
     Raises:
         BadConfiguration: the robot lacks a configuration, cannot make a turn, or has no stated stance for a posture.
-            Or the surface does not hold a slope of the envelope, whatever drives the robot: tan α above μ_s.
+            Or a slope of the envelope is too steep for the surface, whatever drives the robot: tan α above μ_s.
     """
-    for r in asked.each:
-        e = r.envelope
-        requirement_place = f"{asked.source}, {r.name}"
-        if e.configuration:
-            wrong = f"the robot has no configuration {e.configuration}"
-            stated_word(e.configuration, robot.configurations, requirement_place, wrong)
-        turns = r.quantity.group in ("turn", "across")
-        if turns and (why := turn_error(robot, (_configuration_name(robot, e),))):
-            raise BadConfiguration(f"{requirement_place}: {why}")
-        if r.quantity.group == "posture" and (why := reason_without_stance(robot)):
-            raise BadConfiguration(f"{requirement_place}: {why}")
-        chassis = robot.configurations[_configuration_name(robot, e)]
-        friction = float(chassis.ground.friction.static) * adhesion_ratio(e.surface, float(chassis.on_tracks) > 0.5)
+    for r in requirements.each:
+        envelope = r.envelope
+        place = f"{requirements.source}, {r.name}"
+        if envelope.configuration:
+            problem = f"the robot has no configuration {envelope.configuration}"
+            stated_word(envelope.configuration, robot.configurations, place, problem)
+        is_turn = r.quantity.group in ("turn", "across")
+        if is_turn and (reason := turn_error(robot, (_configuration_name(robot, envelope),))):
+            raise BadConfiguration(f"{place}: {reason}")
+        if r.quantity.group == "posture" and (reason := reason_without_stance(robot)):
+            raise BadConfiguration(f"{place}: {reason}")
+        chassis = robot.configurations[_configuration_name(robot, envelope)]
+        friction = float(chassis.ground.friction.static) * adhesion_ratio(
+            envelope.surface, float(chassis.on_tracks) > 0.5
+        )
         steepest = math.degrees(math.atan(friction))
-        if SLOPE in r.quantity.axes and e.slope_deg[1] > steepest:
+        if SLOPE in r.quantity.axes and envelope.slope_deg[1] > steepest:
             raise BadConfiguration(
-                f"{requirement_place}: the envelope's slope_deg goes up to {e.slope_deg[1]:g}; {e.surface} holds "
-                f"{_configuration_name(robot, e)} up to {steepest:.1f} deg (adhesion {friction:.2f}), whatever "
-                "drives it"
+                f"{place}: the envelope's slope_deg goes up to {envelope.slope_deg[1]:g}; {envelope.surface} holds "
+                f"{_configuration_name(robot, envelope)} up to {steepest:.1f} deg (adhesion {friction:.2f}), "
+                "whatever drives it"
             )
 
 
@@ -156,12 +160,18 @@ def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
 
     A condition without influence on the quantity has one value. The number of points depends only on the quantity.
     """
-    e, axes = requirement.envelope, requirement.quantity.axes
-    ambient = e.ambient_C or (float(robot.motor.temperature_ambient),) * 2
-    ranges = {PAYLOAD: e.payload_kg, SLOPE: e.slope_deg, CHARGE: e.charge, AMBIENT: ambient}
+    envelope = requirement.envelope
+    axes = requirement.quantity.axes
+    ambient_range = envelope.ambient_C or (float(robot.motor.temperature_ambient),) * 2
+    ranges = {
+        PAYLOAD: envelope.payload_kg,
+        SLOPE: envelope.slope_deg,
+        CHARGE: envelope.charge,
+        AMBIENT: ambient_range,
+    }
     values = [np.linspace(*ranges[a], VALUES[a]) if a in axes else np.array([ranges[a][-1]]) for a in AXES]
-    payload, slope, charge, warm = (x.ravel() for x in np.meshgrid(*values, indexing="ij"))
-    name = _configuration_name(robot, e)
+    payload, slope, charge, ambient = (x.ravel() for x in np.meshgrid(*values, indexing="ij"))
+    name = _configuration_name(robot, envelope)
     on_tracks = float(robot.configurations[name].on_tracks) > 0.5
 
     def at_all_points(x: float) -> Float[Array, " points"]:
@@ -169,19 +179,21 @@ def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
 
     return EnvelopePoint(
         configuration=jnp.full(len(payload), robot.configurations.index(name)),
-        adhesion=at_all_points(adhesion_ratio(e.surface, on_tracks)),
-        adhesion_lateral=at_all_points(lateral_ratio(e.surface, on_tracks)), battery=at_all_points(float(e.battery)),
-        charge=jnp.asarray(charge), charge_end=at_all_points(e.charge_end), share=at_all_points(requirement.share),
-        slope_deg=jnp.asarray(slope), payload=jnp.asarray(payload), ambient=jnp.asarray(warm),
+        adhesion=at_all_points(adhesion_ratio(envelope.surface, on_tracks)),
+        adhesion_lateral=at_all_points(lateral_ratio(envelope.surface, on_tracks)),
+        battery=at_all_points(float(envelope.battery)),
+        charge=jnp.asarray(charge), charge_end=at_all_points(envelope.charge_end),
+        share=at_all_points(requirement.share),
+        slope_deg=jnp.asarray(slope), payload=jnp.asarray(payload), ambient=jnp.asarray(ambient),
         tread=at_all_points(MM * requirement.tread_mm),
     )  # fmt: skip
 
 
-def _with_parameters(robot: Robot, rated: Ratings, names: Names, theta: Array) -> tuple[Robot, Ratings]:
+def _with_parameters(robot: Robot, ratings: Ratings, names: Names, theta: Array) -> tuple[Robot, Ratings]:
     """Robot with parameters from a vector, and its ratings, which include `battery.cells`."""
     values = dict(zip(names, theta, strict=True))
     cells = values.pop(CELLS)
-    return params.replace(robot, values), dataclasses.replace(rated, cells=cells)
+    return params.replace(robot, values), dataclasses.replace(ratings, cells=cells)
 
 
 def _robot_without_ratings(robot: Robot) -> Robot:
@@ -189,17 +201,21 @@ def _robot_without_ratings(robot: Robot) -> Robot:
 
     Cells and ratings are separate numbers, so that all robots share one program.
     """
-    usual, shaft, gear = type(robot.battery)(), type(robot.motor)(), type(robot.gearbox)()
+    default_battery = type(robot.battery)()
+    default_motor = type(robot.motor)()
+    default_gearbox = type(robot.gearbox)()
     limits = ("voltage_charge", "voltage_cutoff", "delay_cutoff", "current_limit", "current_charge")
     robot = dataclasses.replace(
         robot,
-        battery=dataclasses.replace(robot.battery, cells=1, **{name: getattr(usual, name) for name in limits}),
+        battery=dataclasses.replace(
+            robot.battery, cells=1, **{name: getattr(default_battery, name) for name in limits}
+        ),
         motor=dataclasses.replace(
             robot.motor,
-            **{n: getattr(shaft, n) for n in ("temperature_limit", "voltage_limit", "speed_limit")},
+            **{n: getattr(default_motor, n) for n in ("temperature_limit", "voltage_limit", "speed_limit")},
         ),
         gearbox=dataclasses.replace(
-            robot.gearbox, **{name: getattr(gear, name) for name in ("speed_limit", "torque_limit")}
+            robot.gearbox, **{name: getattr(default_gearbox, name) for name in ("speed_limit", "torque_limit")}
         ),
     )
     return params.without_weak_types(robot)
@@ -208,7 +224,7 @@ def _robot_without_ratings(robot: Robot) -> Robot:
 @compiled
 def _quantity_at_points(
     robot: Robot,
-    rated: Ratings,
+    ratings: Ratings,
     names: Names,
     rows: Float[Array, "rows parameters"],
     at: EnvelopePoint,
@@ -216,21 +232,21 @@ def _quantity_at_points(
 ) -> tuple[Array, Array]:
     """Values and outcomes of a quantity for robots (rows of parameters) at points, shape (rows, points)."""
 
-    def one(theta: Array, point: EnvelopePoint) -> tuple[Array, Array]:
-        changed, changed_ratings = _with_parameters(robot, rated, names, theta)
+    def evaluate(theta: Array, point: EnvelopePoint) -> tuple[Array, Array]:
+        changed, changed_ratings = _with_parameters(robot, ratings, names, theta)
         return evaluate_requirement(changed, point, changed_ratings, name)
 
-    return jax.vmap(lambda theta: jax.vmap(lambda p: one(theta, p))(at))(rows)
+    return jax.vmap(lambda theta: jax.vmap(lambda p: evaluate(theta, p))(at))(rows)
 
 
 @compiled
 def _quantity_gradient(
-    robot: Robot, rated: Ratings, names: Names, theta: Array, at: EnvelopePoint, name: str
+    robot: Robot, ratings: Ratings, names: Names, theta: Array, at: EnvelopePoint, name: str
 ) -> Array:
     """Derivative of a quantity at one point with respect to the parameters."""
 
     def value(theta: Array) -> Array:
-        changed, changed_ratings = _with_parameters(robot, rated, names, theta)
+        changed, changed_ratings = _with_parameters(robot, ratings, names, theta)
         return evaluate_requirement(changed, at, changed_ratings, name)[0]
 
     return jax.grad(value)(theta)
@@ -245,29 +261,34 @@ class _QuantityOfRobot:
     names: Names
 
     @property
-    def at(self) -> EnvelopePoint:
+    def points(self) -> EnvelopePoint:
         return envelope_points(self.robot, self.requirement)
 
-    def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def evaluate(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values in the unit of the name, outcomes, and margins (-inf without a value), shape (rows, points)."""
-        r, point, parts = self.requirement, self.at, []
-        robot, rated = _robot_without_ratings(self.robot), ratings(self.robot)
+        requirement = self.requirement
+        points = self.points
+        chunks = []
+        robot = _robot_without_ratings(self.robot)
+        rating_values = ratings(self.robot)
         for first in range(0, len(rows), ROWS):
             chunk_rows = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
             chunk_results = jax.device_get(
-                _quantity_at_points(robot, rated, self.names, jnp.asarray(chunk_rows), point, _computed_name(r))
+                _quantity_at_points(
+                    robot, rating_values, self.names, jnp.asarray(chunk_rows), points, _computed_name(requirement)
+                )
             )
-            parts.append([x[: len(rows) - first] for x in chunk_results])
-        value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
-        value = value / r.quantity.factor
-        counts = (outcome == CONVERGED) & np.isfinite(value)
-        assert r.limit is not None  # see `fill_in_ratings`
-        margin = (value - r.limit) * (1 if r.least else -1)
-        return value, outcome, np.where(counts, margin, -np.inf)
+            chunks.append([x[: len(rows) - first] for x in chunk_results])
+        value, outcome = (np.concatenate(x) for x in zip(*chunks, strict=True))
+        value = value / requirement.quantity.factor
+        has_value = (outcome == CONVERGED) & np.isfinite(value)
+        assert requirement.limit is not None  # see `fill_in_ratings`
+        margin = (value - requirement.limit) * (1 if requirement.least else -1)
+        return value, outcome, np.where(has_value, margin, -np.inf)
 
-    def worst(self, rows: np.ndarray) -> np.ndarray:
+    def worst_margins(self, rows: np.ndarray) -> np.ndarray:
         """Margin at the worst corner, shape (rows,)."""
-        return self.over(rows)[2].min(axis=1)
+        return self.evaluate(rows)[2].min(axis=1)
 
 
 def _computed_name(requirement: Requirement) -> str:
@@ -277,7 +298,7 @@ def _computed_name(requirement: Requirement) -> str:
 
 def check_requirements(
     robot: Robot,
-    asked: Requirements,
+    requirements: Requirements,
     *,
     changes: bool = True,
     tell: Callable[[Remark], None] = lambda note: None,
@@ -291,158 +312,167 @@ def check_requirements(
     Raises:
         BadConfiguration: see `reject_impossible` and `fill_in_ratings`.
     """
-    reject_impossible(robot, asked)
-    asked = fill_in_ratings(robot, asked)
-    checked_requirements = []
-    for r in asked.each:
+    reject_impossible(robot, requirements)
+    requirements = fill_in_ratings(robot, requirements)
+    quantities = []
+    for r in requirements.each:
         configuration = _configuration_name(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
         by_name = params.parameters_by_name(robot)
         names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
-        checked_requirements.append(
+        quantities.append(
             _QuantityOfRobot(
                 robot, r, (*{name: by_name[name] for name in names if name in by_name}, *of_levers, CELLS)
             )
         )
     outcomes = []
-    for k, h in enumerate(checked_requirements, 1):
-        tell(progress_remark("requirement", k, len(checked_requirements), h.requirement.quantity.label))
-        outcomes.append(_check_requirement(h))
+    for number, quantity in enumerate(quantities, 1):
+        tell(progress_remark("requirement", number, len(quantities), quantity.requirement.quantity.label))
+        outcomes.append(_check_requirement(quantity))
     if not changes:
         return tuple(outcomes)
-    missed, answer = [k for k, o in enumerate(outcomes) if not o.met], list(outcomes)
-    for n, k in enumerate(missed, 1):
-        tell(progress_remark("changes", n, len(missed), checked_requirements[k].requirement.quantity.label))
-        answer[k] = _add_changes(checked_requirements[k], outcomes[k], checked_requirements, outcomes)
-    return tuple(answer)
+    missed = [number for number, o in enumerate(outcomes) if not o.met]
+    outcomes_with_changes = list(outcomes)
+    for n, number in enumerate(missed, 1):
+        tell(progress_remark("changes", n, len(missed), quantities[number].requirement.quantity.label))
+        outcomes_with_changes[number] = _add_changes(quantities[number], outcomes[number], quantities, outcomes)
+    return tuple(outcomes_with_changes)
 
 
-def _present_values(held: _QuantityOfRobot) -> np.ndarray:
-    value_of_name = params.values_by_name(held.robot)
-    return np.array([held.robot.battery.cells if n == CELLS else value_of_name[n] for n in held.names], float)
-
-
-def _check_requirement(held: _QuantityOfRobot) -> RequirementOutcome:
-    r = held.requirement
-    value, outcome, margin = (x[0] for x in held.over(_present_values(held)[None]))
-    # A point without a value is worse than any other. Among points with the same outcome, the largest is the worst
-    # corner.
-    k = int(np.argmin(margin))
-    status = STATUSES[outcome[k]]
-    counts = np.isfinite(margin[k])
-    if not counts and status == STATUSES[CONVERGED]:  # beyond all bounds: a temperature that never settles
-        status = "unbounded"
-    return RequirementOutcome(
-        r,
-        float(value[k]) if counts else None,
-        float(margin[k]) if counts else None,
-        status,
-        _named_corner(held, k),
+def _present_values(quantity: _QuantityOfRobot) -> np.ndarray:
+    value_of_name = params.values_by_name(quantity.robot)
+    return np.array(
+        [quantity.robot.battery.cells if name == CELLS else value_of_name[name] for name in quantity.names], float
     )
 
 
-def _named_corner(held: _QuantityOfRobot, k: int) -> Json:
+def _check_requirement(quantity: _QuantityOfRobot) -> RequirementOutcome:
+    r = quantity.requirement
+    value, outcome, margin = (x[0] for x in quantity.evaluate(_present_values(quantity)[None]))
+    # A point without a value is worse than any other. Among points with the same outcome, the largest is the worst
+    # corner.
+    worst = int(np.argmin(margin))
+    status = STATUSES[outcome[worst]]
+    has_value = np.isfinite(margin[worst])
+    if not has_value and status == STATUSES[CONVERGED]:  # beyond all bounds: a temperature that never settles
+        status = "unbounded"
+    return RequirementOutcome(
+        r,
+        float(value[worst]) if has_value else None,
+        float(margin[worst]) if has_value else None,
+        status,
+        _named_corner(quantity, worst),
+    )
+
+
+def _named_corner(quantity: _QuantityOfRobot, k: int) -> Json:
     """A point as entries with the names of a requirements file."""
-    r, point = held.requirement, held.at
-    e = r.envelope
-    places = {
-        PAYLOAD: ("payload_kg", point.payload), SLOPE: ("slope_deg", point.slope_deg),
-        AMBIENT: ("ambient_C", point.ambient),
-        CHARGE: ("state_of_charge" if e.battery else "supply_voltage_V", point.charge),
+    r, points = quantity.requirement, quantity.points
+    envelope = r.envelope
+    entries = {
+        PAYLOAD: ("payload_kg", points.payload), SLOPE: ("slope_deg", points.slope_deg),
+        AMBIENT: ("ambient_C", points.ambient),
+        CHARGE: ("state_of_charge" if envelope.battery else "supply_voltage_V", points.charge),
     }  # fmt: skip
-    corner: Json = {places[a][0]: round(float(np.asarray(places[a][1])[k]), 9) for a in r.quantity.axes}
+    corner: Json = {entries[axis][0]: round(float(np.asarray(entries[axis][1])[k]), 9) for axis in r.quantity.axes}
     if r.name == "endurance_min":
-        low = e.charge_end
+        low = envelope.charge_end
         corner |= {
             "duty": "driving" if r.share else "standing",
             "share": r.share,
-            "state_of_charge": [low, e.charge[1]],
+            "state_of_charge": [low, envelope.charge[1]],
         }
     if r.name == STAIRS:
         corner[TREAD] = r.tread_mm
-    return {"configuration": _configuration_name(held.robot, e), "surface": e.surface, **corner}
+    return {"configuration": _configuration_name(quantity.robot, envelope), "surface": envelope.surface, **corner}
 
 
 def _add_changes(
-    held: _QuantityOfRobot,
+    quantity: _QuantityOfRobot,
     outcome: RequirementOutcome,
-    every: Sequence[_QuantityOfRobot],
-    now: Sequence[RequirementOutcome],
+    quantities: Sequence[_QuantityOfRobot],
+    outcomes: Sequence[RequirementOutcome],
 ) -> RequirementOutcome:
-    changes = _find_changes(held, outcome)
+    changes = _find_changes(quantity, outcome)
     if not changes:
         return outcome
-    rows = np.stack([_row_with_value(held, c.parameter, c.after) for c in changes])
+    rows = np.stack([_row_with_value(quantity, change.parameter, change.after) for change in changes])
     broken: list[list[str]] = [[] for _ in changes]
-    for other, before in zip(every, now, strict=True):
-        if other is held or not before.met:
+    for other, present_outcome in zip(quantities, outcomes, strict=True):
+        if other is quantity or not present_outcome.met:
             continue
         # Other configurations have other names. Common names are changed.
-        present = np.tile(_present_values(other), (len(rows), 1))
-        for k, name in enumerate(held.names):
+        parameter_rows = np.tile(_present_values(other), (len(rows), 1))
+        for k, name in enumerate(quantity.names):
             if name in other.names:
-                present[:, other.names.index(name)] = rows[:, k]
-        for names, margin in zip(broken, other.worst(present), strict=True):
+                parameter_rows[:, other.names.index(name)] = rows[:, k]
+        for names, margin in zip(broken, other.worst_margins(parameter_rows), strict=True):
             names += [other.requirement.name] if margin < 0 else []
     with_breaks = [
-        dataclasses.replace(c, breaks=tuple(dict.fromkeys(b))) for c, b in zip(changes, broken, strict=True)
+        dataclasses.replace(change, breaks=tuple(dict.fromkeys(names)))
+        for change, names in zip(changes, broken, strict=True)
     ]
-    order = sorted(with_breaks, key=lambda c: (len(c.breaks) > 0, abs(math.log(c.after / c.before))))
+    order = sorted(
+        with_breaks, key=lambda change: (len(change.breaks) > 0, abs(math.log(change.after / change.before)))
+    )
     return dataclasses.replace(outcome, change=tuple(order))
 
 
-def _row_with_value(held: _QuantityOfRobot, name: str, value: float) -> np.ndarray:
-    row = _present_values(held)
-    row[held.names.index(name)] = value
+def _row_with_value(quantity: _QuantityOfRobot, name: str, value: float) -> np.ndarray:
+    row = _present_values(quantity)
+    row[quantity.names.index(name)] = value
     return row
 
 
-def _find_changes(held: _QuantityOfRobot, outcome: RequirementOutcome) -> list[ParameterChange]:
+def _find_changes(quantity: _QuantityOfRobot, outcome: RequirementOutcome) -> list[ParameterChange]:
     """Single changes with which a requirement is met.
 
     The direction follows from the derivative at the worst corner. The nearest value that meets the requirement at
     every corner is found by a coarse search and bisection. Each result is verified.
     """
-    present_values, names = _present_values(held), held.names
-    worst = int(np.argmin(held.over(present_values[None])[2][0]))
-    point = jax.tree.map(lambda x: x[worst], held.at)
-    slopes = np.asarray(
+    present_values = _present_values(quantity)
+    names = quantity.names
+    worst = int(np.argmin(quantity.evaluate(present_values[None])[2][0]))
+    point = jax.tree.map(lambda x: x[worst], quantity.points)
+    gradient = np.asarray(
         _quantity_gradient(
-            _robot_without_ratings(held.robot),
-            ratings(held.robot),
+            _robot_without_ratings(quantity.robot),
+            ratings(quantity.robot),
             names,
             jnp.asarray(present_values),
             point,
-            _computed_name(held.requirement),
+            _computed_name(quantity.requirement),
         )
     )
-    slopes = slopes / held.requirement.quantity.factor * (1 if held.requirement.least else -1)
-    by_name = params.parameters_by_name(held.robot)
+    gradient = gradient / quantity.requirement.quantity.factor * (1 if quantity.requirement.least else -1)
+    by_name = params.parameters_by_name(quantity.robot)
     changes = []
     for k, name in enumerate(names):
         if name == CELLS:
-            bounds, unit = (1.0, 100.0), "-"
+            bounds = (1.0, 100.0)
+            unit = "-"
         else:
             bounds, unit = by_name[name].spec.bounds, by_name[name].spec.unit
         if present_values[k] <= 0:
             continue
-        low, high = max(bounds[0], REACH[0] * present_values[k]), min(bounds[1], REACH[1] * present_values[k])
-        uphill = slopes[k] if np.isfinite(slopes[k]) else 0.0
-        if outcome.margin is not None and uphill == 0:
+        low = max(bounds[0], REACH[0] * present_values[k])
+        high = min(bounds[1], REACH[1] * present_values[k])
+        slope = gradient[k] if np.isfinite(gradient[k]) else 0.0
+        if outcome.margin is not None and slope == 0:
             continue  # no influence
         # Without a value the derivative is not informative, so both directions are tried.
-        ends = (low, high) if outcome.margin is None or uphill == 0 else (high if uphill > 0 else low,)
-        options = [v for end in ends if (v := _nearest_value(held, name, present_values[k], end)) is not None]
-        if options:
-            nearest_value = min(options, key=lambda v: abs(math.log(v / present_values[k])))
-            sense = 1 if held.requirement.least else -1
+        ends = (low, high) if outcome.margin is None or slope == 0 else (high if slope > 0 else low,)
+        candidates = [v for end in ends if (v := _nearest_value(quantity, name, present_values[k], end)) is not None]
+        if candidates:
+            nearest_value = min(candidates, key=lambda v: abs(math.log(v / present_values[k])))
+            sense = 1 if quantity.requirement.least else -1
             changes.append(
-                ParameterChange(name, float(present_values[k]), nearest_value, unit, float(sense * slopes[k]))
+                ParameterChange(name, float(present_values[k]), nearest_value, unit, float(sense * gradient[k]))
             )
     return changes
 
 
-def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
+def _nearest_value(quantity: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
     """Parameter value nearest to `begin`, in the direction of `end`, that meets the requirement. None if there is
     none.
     """
@@ -450,27 +480,29 @@ def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) 
         return None
 
     def meets(values: np.ndarray) -> np.ndarray:
-        return held.worst(np.stack([_row_with_value(held, name, v) for v in values])) >= 0
+        return quantity.worst_margins(np.stack([_row_with_value(quantity, name, v) for v in values])) >= 0
 
-    def steps(a: float, b: float, count: int) -> np.ndarray:
+    def values_between(a: float, b: float, count: int) -> np.ndarray:
         if name == CELLS:
             integer_steps = np.arange(round(min(a, b)), round(max(a, b)) + 1, dtype=float)
             return (integer_steps if a < b else integer_steps[::-1])[1:]
         return np.geomspace(a, b, count + 1)[1:]
 
-    ladder = steps(begin, end, LADDER)
-    good = np.flatnonzero(meets(ladder))
-    if not good.size:
+    coarse = values_between(begin, end, LADDER)
+    meeting = np.flatnonzero(meets(coarse))
+    if not meeting.size:
         return None
-    first_place = int(good[0])
+    first = int(meeting[0])
     if name == CELLS:
-        return float(ladder[first_place])
-    a, b = (begin if first_place == 0 else ladder[first_place - 1]), ladder[first_place]
+        return float(coarse[first])
+    a = begin if first == 0 else coarse[first - 1]
+    b = coarse[first]
     for _ in range(3):
-        finer = steps(a, b, ROWS)
-        places_that_meet = np.flatnonzero(meets(finer))
-        k = int(places_that_meet[0]) if places_that_meet.size else len(finer) - 1
-        a, b = (a if k == 0 else finer[k - 1]), finer[k]
+        finer = values_between(a, b, ROWS)
+        meeting_finer = np.flatnonzero(meets(finer))
+        k = int(meeting_finer[0]) if meeting_finer.size else len(finer) - 1
+        a = a if k == 0 else finer[k - 1]
+        b = finer[k]
     # Rounded to few digits, away from `begin`. Each rounded value is tested.
     for digits in (DIGITS, DIGITS + 2, DIGITS + 4):
         up = end > begin
