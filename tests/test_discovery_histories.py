@@ -61,7 +61,7 @@ def seen(runs, clean):
     """Runs, space, coordinates and the linear model where the loop's fit ends."""
     space, z = clean.space, clean.base.z[: clean.space.free]
     # Without the run that is already known, because robots with other effects are simulated here.
-    problem = replace(space.bare, observe=replace(space.bare.observe, known=None))
+    problem = replace(space.bare, observe=replace(space.bare.observe, simulated_runs=None))
     read = jax.jit(lambda r: problem.whitened(problem.observe(r))[: problem.data.measured.size])
     return SimpleNamespace(
         runs=runs, space=space, problem=problem, z=jnp.asarray(z), linear=clean.left.linear, read=read
@@ -188,7 +188,7 @@ def test_memory_tells_noise_from_what_remembers(seen):
     def of(x):
         residual = np.zeros(linear.residual.size)
         residual[: 3 * linear.rows] = x.ravel()
-        return float(replace(linear, residual=jnp.asarray(residual)).memory())
+        return float(replace(linear, residual=jnp.asarray(residual)).autocorrelation())
 
     white = [of(rng.standard_normal((linear.rows, 3))) for _ in range(60)]
     assert -1.0 < np.mean(white) < 2.0 and np.quantile(white, 0.95) < 5.0

@@ -208,7 +208,7 @@ def test_a_delay_is_freed_if_the_error_lies_after_the_steps(tmp_path, monkeypatc
     if freed:
         (z,) = found.starts
         assert dict(zip(again[0], z, strict=True)) == dict.fromkeys(first, 1.0) | {"rig.delay": 0.0}
-        assert "so rig.delay is fitted" in describe(setting.ready.weighed[-1])
+        assert "so rig.delay is fitted" in describe(setting.prepared.mass_remarks[-1])
 
 
 @pytest.mark.parametrize("late", [-0.004, 0.01])

@@ -238,4 +238,4 @@ def test_running_gear_is_found_through_the_track_model():
         free=("default", "running_gear.guide_recess", "running_gear.contact_damping"), generations=5,
     )  # fmt: skip
     assert found.errors_after["speed"].rms_percent < 0.6 * found.errors_before["speed"].rms_percent
-    assert found.searched is not None and len(found.searched.found.z) > 48
+    assert found.searched is not None and len(found.searched.population.z) > 48

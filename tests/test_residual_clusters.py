@@ -56,7 +56,7 @@ def left(seed, columns=None, shift=None, channel=SPEED):
     if shift is not None:
         added = np.zeros((ROWS, 3))
         added[:, channel] = shift(made.runs, columns)
-        free = np.eye(added.size) - (made.taken @ made.taken.T)[: added.size, : added.size]
+        free = np.eye(added.size) - (made.absorbed @ made.absorbed.T)[: added.size, : added.size]
         whitened = whitened - (free @ added.ravel()).reshape(ROWS, 3)
     made = dataclasses.replace(made, runs=dataclasses.replace(made.runs, extras=columns))
     return leaving(made, whitened)
@@ -74,7 +74,7 @@ def test_wild_residuals_make_no_cluster():
 
     def wild(seed):
         made, rng = left(seed), np.random.default_rng(seed)
-        free = np.eye(3 * ROWS) - (made.taken @ made.taken.T)[: 3 * ROWS, : 3 * ROWS]
+        free = np.eye(3 * ROWS) - (made.absorbed @ made.absorbed.T)[: 3 * ROWS, : 3 * ROWS]
         noise = (free @ rng.standard_t(2.5, 3 * ROWS)).reshape(ROWS, 3)
         return leaving(made, noise)
 

@@ -203,7 +203,7 @@ def test_a_delay_reads_the_run_of_each_row_and_takes_memory_by_rows():
     run, instant, rows_of = (jnp.asarray(x) for x in order)
     steps = every[:, :-1], every[:, :-1], every[:, 1:], np.zeros((2, 2))  # on straight lines
     made = Histories(Conditions(0, 1.0), jnp.asarray(times), run, instant, rows_of, rows_of)
-    seen = jax.jit(lambda x: made.late(x, Rig(delay=0.1)))(steps)
+    seen = jax.jit(lambda x: made.delayed_values(x, Rig(delay=0.1)))(steps)
     at = np.maximum(times[run, instant] - 0.1, 0.0)
     assert_allclose(seen, np.stack([10 * at, -at], -1), rtol=1e-12)
 
@@ -212,7 +212,7 @@ def test_a_delay_reads_the_run_of_each_row_and_takes_memory_by_rows():
     long = Histories(
         Conditions(0, 1.0), np.linspace(0, 1, count)[None], np.zeros(count, int), along, of_first, of_first
     )
-    late = jax.jit(lambda x: long.late((x[:, :-1], x[:, :-1], x[:, 1:], x[:, 1:, 0]), Rig(delay=0.1)))
+    late = jax.jit(lambda x: long.delayed_values((x[:, :-1], x[:, :-1], x[:, 1:], x[:, 1:, 0]), Rig(delay=0.1)))
     program = late.lower(np.zeros((1, count, 2))).compile()
     assert program.memory_analysis().temp_size_in_bytes < 8 * 100 * count
 

@@ -90,7 +90,7 @@ def test_a_step_of_a_fit_whose_roots_are_known_searches_for_none(robot, of_world
         return dataclasses.replace(posed, roots=roots).linearised(posed.robot, z)[1]
 
     known = str(jax.make_jaxpr(step)(jnp.zeros(3), roots))
-    assert posed.observe.apart and "custom_jvp_call" in known
+    assert posed.observe.solves_separately and "custom_jvp_call" in known
     assert "while[" not in known
 
 

@@ -112,7 +112,7 @@ def test_points_are_each_side_of_each_row(posed, linear):
 def test_what_a_channel_of_one_side_shows_is_off_by_that_side_alone(linear):
     shapes = np.ones((linear.points, 1))
     shapes[: linear.rows] = 0.0  # the right side alone
-    by = [np.asarray(linear.shown(k, shapes)).reshape(linear.rows, -1) for k in range(len(linear.channels))]
+    by = [np.asarray(linear.channel_columns(k, shapes)).reshape(linear.rows, -1) for k in range(len(linear.channels))]
     moved = [float(np.abs(x).max()) for x in by]
     sides = {"left": 0.0, "right": 1.0}
     for k, name in enumerate(linear.channels):

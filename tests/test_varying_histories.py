@@ -245,7 +245,7 @@ def test_one_supply_voltage_is_said_only_where_the_duty_is_one_too(runs):
 
 
 def test_stretches_are_the_segments(runs, observer):
-    for found in (intervals_by_run(runs), observer.stretches()):
+    for found in (intervals_by_run(runs), observer.constant_intervals()):
         assert [len(run) for run in found] == [4, 4, 4]
         for run in found:
             assert_allclose([s.begin for s in run], SEGMENTS[:4], atol=1e-12)

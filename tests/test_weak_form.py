@@ -167,10 +167,10 @@ def test_noise_of_simulated_states_is_not_that_of_readings(space):
     rows, exact = (shown_states.points_and_windows(p, plan)[0] for p in (noisy, quiet))
     smooth = weak_form.with_smooth_states(noisy, plan, rows, z)
     moving = np.asarray(rows.way) != 0
-    off, read = ((np.asarray(x.shown) - np.asarray(exact.shown))[moving] for x in (smooth, rows))
+    off, read = ((np.asarray(x.readings) - np.asarray(exact.readings))[moving] for x in (smooth, rows))
     for k in range(off.shape[1]):
         assert abs(np.corrcoef(off[:, k], read[:, k])[0, 1]) < 0.1
-    assert np.all(np.std(off, axis=0) < 0.05 * np.std(exact.shown, axis=0))
+    assert np.all(np.std(off, axis=0) < 0.05 * np.std(exact.readings, axis=0))
 
 
 def test_windows_hold_no_jump_and_readings_show_the_current_before_one(space, before, monkeypatch):

@@ -253,7 +253,7 @@ def unnamed_discrepancy(
     if not simulated:
         fitted, linear = beside.fitted, beside.diagnosis.linear
         at, value, sd, score = fitted.grid, fitted.curve, fitted.sd, fitted.chi2[0] - fitted.chi2[1]
-        if beside.space.bare.observe.rows_tell:
+        if beside.space.bare.observe.one_row_reveals:
             happens = bases.window_from_name(where.variable)
             x, way = linear.curve_variable(where.place, where.variable if happens is None else happens.axis)
             remains, row_sd = projection.balance_error_by_row(linear, where.place)

@@ -96,7 +96,7 @@ def with_misfit(space: CandidateSpace, fit: Candidate) -> CandidateSpace:
     return space if max(variance) == 1 else space.with_noise(sd * np.sqrt(variance), space.weight)
 
 
-_memory = functools.partial(compiled, options=SELDOM)(HistoriesLinearization.memory)
+_memory = functools.partial(compiled, options=SELDOM)(HistoriesLinearization.autocorrelation)
 
 
 def refine_by_simulation(space: CandidateSpace, fitted: Candidate, starts: Sequence[np.ndarray]) -> Candidate:

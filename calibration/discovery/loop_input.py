@@ -121,13 +121,19 @@ def prepare_loop(
             f"{kind.fewest} are needed"
         )
     ready = preparation.prepare_input(distinct, robot, noise, stated, settled=(*settled, *of_sides))
-    for note in fit_notes.remarks_with_codes(ready.checked, "nothing_varies", "copied"):
+    for note in fit_notes.remarks_with_codes(ready.table_remarks, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
     unshown = shown_states.missing_states_remarks(distinct, ready.robot)
-    at_first = (*ready.foreign, *ready.doubted, *unshown, *fit_notes.remarks_with_codes(ready.checked, "lost_motion"))
+    at_first = (
+        *ready.inherited_remarks,
+        *ready.log_remarks,
+        *unshown,
+        *fit_notes.remarks_with_codes(ready.table_remarks, "lost_motion"),
+    )
     notes_so_far: fit_notes.Notes = (
-        *notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted, *unshown
+        *notes, *ready.table_remarks, *ready.start_remarks, *ready.mass_remarks, *ready.inherited_remarks,
+        *ready.log_remarks, *unshown
     )  # fmt: skip
     output_turn = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}

@@ -228,7 +228,7 @@ def _common_property(found: Screening, runs: Runs, settings: Settings) -> Outlie
     """Property that the outliers share."""
     rows, included = np.arange(len(runs)), found.base.space.included
     axes = {a: runs[c] for a, c in (("time", "time_s"), ("order", "order")) if runs.has(c)}
-    angle = found.diagnosed[0].turned()
+    angle = found.diagnosed[0].shaft_angle()
     if angle is not None:
         axes["angle of the driving shaft"] = angle[rows] % (2 * np.pi)
     levels = {c: runs[c] for c in LEVELS if runs.has(c)}

@@ -85,7 +85,7 @@ def balance_error_by_row(linear: Linearization, place: str) -> tuple[np.ndarray,
     per unit error of the equation in row i. In time histories the error is largest at that instant and falls to zero
     at the neighbouring knots. Rows between knots are NaN.
     """
-    places = linear.places()
+    places = linear.revealing_rows()
     shapes = np.zeros((linear.rows, len(places)))
     shapes[places, np.arange(len(places))] = 1.0
     columns = place_signature(linear, place, shapes)

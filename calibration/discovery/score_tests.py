@@ -161,7 +161,7 @@ def normal_deviate(chi2: Array, freedom: Array) -> Array:
 class StrongestStatistics(eqx.Module):
     """Strongest statistics of a fit: |single|, pair [σ²], curve [normal deviate], and χ² and memory of the residuals.
 
-    `settled` is True if the fit is an optimum. `white` is `Linearization.memory`.
+    `settled` is True if the fit is an optimum. `white` is `Linearization.autocorrelation`.
     """
 
     single: Array
@@ -179,7 +179,7 @@ def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Strongest
         jnp.max(scores.pair),
         jnp.max(scores.curve),
         jnp.sum(linear.residual**2),
-        linear.memory(),
+        linear.autocorrelation(),
         scores.fall < UNSETTLED,
     )
 

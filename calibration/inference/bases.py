@@ -106,9 +106,11 @@ class Basis(eqx.Module):
         Families are computed one at a time to save memory.
         """
         of_channels = is_channel_place(self.places[0])
-        places_known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
-        places = jnp.asarray([places_known.index(place) for place in self.places])
-        return jax.lax.map(lambda family: function(change(*family)), (places, self.columns))
+        place_names, columns_of_place = (
+            (linear.channels, linear.channel_columns) if of_channels else (linear.probed, linear.columns)
+        )
+        places = jnp.asarray([place_names.index(place) for place in self.places])
+        return jax.lax.map(lambda family: function(columns_of_place(*family)), (places, self.columns))
 
 
 Bases = tuple[Basis, ...]
@@ -146,14 +148,15 @@ def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np
     terms).
     """
     if is_channel_place(place):
-        return np.asarray(linear.shown(linear.channels.index(place), shapes))
+        return np.asarray(linear.channel_columns(linear.channels.index(place), shapes))
     return np.asarray(linear.columns(linear.probed.index(place), shapes))
 
 
 def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """x mapped linearly so that rows of positive weight span -1 to 1. Zeros if x does not vary."""
-    counting = x[weight > 0]
-    low, high = counting.min(), counting.max()
+    included = x[weight > 0]
+    low = included.min()
+    high = included.max()
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
@@ -235,18 +238,18 @@ def curve_families(columns: Columns, weight: np.ndarray, ways: Ways, scope: Curv
     channel_variables = [(c, v) for c in scope.channels for v in substitutes if v in AXES or v == READ_BY.get(c)]
     new = [n for n in channel_variables if substitutes[n[1]] == n[1]]
     # As above: a skipped curve is replaced by another of its channel, or else by the first.
-    read = (
+    channel_curves = (
         [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in channel_variables] if new else []
     )
     groups = [
         (names, [curve(*n) for n in names]),
         (
-            [(b, CONDITIONS) for b in scope.balances],
-            [condition_polynomials(columns, weight, scope, ways, b) for b in scope.balances],
+            [(balance, CONDITIONS) for balance in scope.balances],
+            [condition_polynomials(columns, weight, scope, ways, balance) for balance in scope.balances],
         ),
-        (read, [curve(*n) for n in read]),
+        (channel_curves, [curve(*n) for n in channel_curves]),
     ]
-    return tuple(Basis.of(np.stack(b), ns) for ns, b in groups if ns)
+    return tuple(Basis.of(np.stack(curves), names_of_group) for names_of_group, curves in groups if names_of_group)
 
 
 def condition_polynomials(
@@ -303,13 +306,14 @@ def window_families(columns: Columns, weight: np.ndarray, ways: Ways, scope: Cur
     Windows of time are at the same instants in all runs. They are omitted if the conditions determine time or order.
     Arguments as in `curve_families`.
     """
-    counts = weight > 0
-    facing = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # also for starts from rest
-    offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
+    is_included = weight > 0
+    signs = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # also for starts from rest
+    windows: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
     if axis is not None:
         x = np.asarray(columns[VARIABLES[axis]], float)
-        low, high = x[counts].min(), x[counts].max()
+        low = x[is_included].min()
+        high = x[is_included].max()
         # Consecutive runs then have similar conditions, and conditions have windows of their own.
         sorted_runs = order_collinearity(columns, weight, scope.axes, VARIABLES[axis]) > COLLINEAR[axis]
         for share in WINDOWS:
@@ -317,25 +321,25 @@ def window_families(columns: Columns, weight: np.ndarray, ways: Ways, scope: Cur
             for k in range(round(2 / share) - 1):
                 window_start = low + k * size / 2
                 is_inside = (x >= window_start) & ((x < window_start + size) | (k == round(2 / share) - 2))
-                offered.append((axis, x, counts & is_inside & (not sorted_runs)))
+                windows.append((axis, x, is_included & is_inside & (not sorted_runs)))
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in scope.axes:
             continue
         values = factor * np.asarray(columns[VARIABLES[condition]], float)
-        x, _ = in_travel_frame(SHAFTS, condition, values, facing.__getitem__)
-        levels = np.unique(x[counts])
+        x, _ = in_travel_frame(SHAFTS, condition, values, signs.__getitem__)
+        levels = np.unique(x[is_included])
         levels = levels if 2 < len(levels) <= MOST_LEVELS else levels[:0]
-        offered += [(condition, x, counts & (x == level)) for level in levels]
-        offered += [(condition, x, np.zeros_like(counts))] * (MOST_LEVELS - len(levels))
+        windows += [(condition, x, is_included & (x == level)) for level in levels]
+        windows += [(condition, x, np.zeros_like(is_included))] * (MOST_LEVELS - len(levels))
     shapes = [
         (is_inside.astype(float), str(Window(axis, float(x[is_inside].min()), float(x[is_inside].max()))))
-        for axis, x, is_inside in offered
-        if FEWEST <= is_inside.sum() <= 0.5 * counts.sum()
+        for axis, x, is_inside in windows
+        if FEWEST <= is_inside.sum() <= 0.5 * is_included.sum()
     ]
     if not shapes:
         return ()
     # The first again for windows with too few or too many rows: tables of one size share compiled programs.
-    shapes += shapes[:1] * (len(offered) - len(shapes))
+    shapes += shapes[:1] * (len(windows) - len(shapes))
     return tuple(
         Basis.of(
             np.stack(
@@ -352,45 +356,46 @@ def order_collinearity(columns: Columns, weight: np.ndarray, axes: Sequence[str]
     """Share of the variance of the order of runs, or of their time, that their conditions explain (R²).
 
     If it is 1, drift from run to run cannot be separated from effects of the conditions. Conditions enter as a
-    polynomial of the slope and a level for each combination of configuration, imposed quantity, duty and payload. If
-    these combinations are many compared with the runs, they enter instead as a level for each configuration and
-    direction, and polynomials of the others and of their ranks.
+    polynomial of the slope and a level for each combination of configuration, imposed quantity, duty and payload.
+    With many combinations for the number of runs, they enter as a level for each configuration and direction.
+    Polynomials of the other conditions and of their ranks are then added.
 
     Args:
         columns, weight: as in `curve_families`.
         axes: columns of the conditions.
         column: `order` or `time_s`.
     """
-    counts = weight > 0
-    x = np.asarray(columns[column], float)[counts]
-    if len(x) < 4 or np.ptp(x) == 0:
+    is_included = weight > 0
+    order_or_time = np.asarray(columns[column], float)[is_included]
+    if len(order_or_time) < 4 or np.ptp(order_or_time) == 0:
         return 1.0
-    _, configuration = np.unique(np.asarray(columns["configuration"])[counts], return_inverse=True)
+    _, configuration = np.unique(np.asarray(columns["configuration"])[is_included], return_inverse=True)
     conditions = (*axes, *(["duty"] if "duty" in columns else []))
     other_conditions = [c for c in conditions if c != VARIABLES["slope"]]
-    values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in other_conditions)], 1)
+    values = np.stack([configuration, *(np.asarray(columns[c], float)[is_included] for c in other_conditions)], 1)
     _, group_index = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
     _, cell_index = np.unique(values, axis=0, return_inverse=True)
-    few = cell_index.max() + 1 <= FEW_CELLS * len(x)
-    smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
-    level = cell_index.ravel() if few else group_index.ravel()
-    spans = [scale_to_unit_range(np.asarray(columns[c], float), weight)[counts] for c in smooth]
+    has_few_cells = cell_index.max() + 1 <= FEW_CELLS * len(order_or_time)
+    smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if has_few_cells else conditions
+    level = cell_index.ravel() if has_few_cells else group_index.ravel()
+    spans = [scale_to_unit_range(np.asarray(columns[c], float), weight)[is_included] for c in smooth]
     polynomials = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
     for span in spans:  # a sorted table's order is the rank
         rank = np.searchsorted(np.sort(span), span, "left") + np.searchsorted(np.sort(span), span, "right")
-        polynomials.append(rank[:, None] / (2 * len(x)))
-    terms = np.concatenate([np.zeros((len(x), 1)), *polynomials], 1)
+        polynomials.append(rank[:, None] / (2 * len(order_or_time)))
+    terms = np.concatenate([np.zeros((len(order_or_time), 1)), *polynomials], 1)
     # Without the means of each level: a matrix with a column for each level would be rows times rows.
     count = np.bincount(level)
-    inner, terms_left = (
-        v - (np.stack([np.bincount(level, c) for c in v.T], 1) / count[:, None])[level] for v in (terms, x[:, None])
+    centred_terms, unexplained = (
+        v - (np.stack([np.bincount(level, c) for c in v.T], 1) / count[:, None])[level]
+        for v in (terms, order_or_time[:, None])
     )
-    ways, size, _ = np.linalg.svd(inner, full_matrices=False)
-    ways = ways[:, size > len(x) * np.finfo(float).eps * np.linalg.norm(terms)]
-    terms_left = terms_left - ways @ (ways.T @ terms_left)
-    terms_used = len(count) + ways.shape[1]
-    freedom = (len(x) - 1) / max(len(x) - terms_used, 1)
-    return float(1 - freedom * np.sum(terms_left**2) / np.sum((x - x.mean()) ** 2))
+    directions, size, _ = np.linalg.svd(centred_terms, full_matrices=False)
+    directions = directions[:, size > len(order_or_time) * np.finfo(float).eps * np.linalg.norm(terms)]
+    unexplained = unexplained - directions @ (directions.T @ unexplained)
+    terms_used = len(count) + directions.shape[1]
+    freedom = (len(order_or_time) - 1) / max(len(order_or_time) - terms_used, 1)
+    return float(1 - freedom * np.sum(unexplained**2) / np.sum((order_or_time - order_or_time.mean()) ** 2))
 
 
 def wave_families(
@@ -409,31 +414,31 @@ def wave_families(
         knots: rows between which an error is linear, shape (runs, knots).
         balances: balances with waves.
     """
-    bases, words = [], []
-    for word, (order, belted) in ORDERS.items():
-        wave, pieces = np.zeros((2, len(angle), 2 * len(rows)))
-        for k, row in enumerate(rows):
-            rows_of_wave = row[row >= 0]
-            if len(rows_of_wave) < 8 or (belted and not on_tracks[rows_of_wave[0]]):
+    bases, wave_names = [], []
+    for wave_name, (order, of_belt) in ORDERS.items():
+        wave, short_waves = np.zeros((2, len(angle), 2 * len(rows)))
+        for k, padded_rows in enumerate(rows):
+            rows_of_wave = padded_rows[padded_rows >= 0]
+            if len(rows_of_wave) < 8 or (of_belt and not on_tracks[rows_of_wave[0]]):
                 continue
             phase = order * angle[rows_of_wave]
             step = np.abs(np.diff(order * angle[knots[k]]))
             if not step.any() or np.median(step[step > 0]) > RESOLVED:
                 continue
             shape = np.stack([np.cos(phase), np.sin(phase)], 1)
-            pieces[rows_of_wave, :2] = shape
+            short_waves[rows_of_wave, :2] = shape
             if np.ptp(phase) >= 4 * np.pi:
                 wave[rows_of_wave, 2 * k : 2 * k + 2] = shape
-        if pieces.any():
-            bases.append(wave if wave.any() else pieces)
-            words.append(word)
-    if not words:
+        if short_waves.any():
+            bases.append(wave if wave.any() else short_waves)
+            wave_names.append(wave_name)
+    if not wave_names:
         return ()
     # The first again for orders that these samples do not resolve: logs of one size share compiled programs.
-    possible = sum(1 for _, belted in ORDERS.values() if np.any(on_tracks) or not belted)
+    possible = sum(1 for _, of_belt in ORDERS.values() if np.any(on_tracks) or not of_belt)
     bases += bases[:1] * (possible - len(bases))
-    words += words[:1] * (possible - len(words))
-    return (Basis.of(np.stack(bases * len(balances)), [(b, w) for b in balances for w in words]),)
+    wave_names += wave_names[:1] * (possible - len(wave_names))
+    return (Basis.of(np.stack(bases * len(balances)), [(b, w) for b in balances for w in wave_names]),)
 
 
 def family_names(bases: Bases) -> tuple[tuple[str, str], ...]:

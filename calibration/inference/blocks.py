@@ -70,13 +70,13 @@ def blocks_by_sharpness(runs: Runs) -> Columns:
 
     Turns are sorted by the ratio of the slower side's command to that of the faster side, -1 to 1.
     """
-    slow, fast = np.sort(np.abs(runs.of_sides), 0)
-    share = np.round(slow / np.maximum(fast, 1e-12) * np.sign(np.prod(runs.of_sides, 0)), 6)
+    slower, faster = np.sort(np.abs(runs.of_sides), 0)
+    share = np.round(slower / np.maximum(faster, 1e-12) * np.sign(np.prod(runs.of_sides, 0)), 6)
     part = np.searchsorted(np.sort(share), share) * PARTS // len(share)
-    rows = [part == k for k in np.unique(part)]
+    masks = [part == k for k in np.unique(part)]
     return (
-        {f"{share[block_rows].min():.2g} to {share[block_rows].max():.2g}": block_rows for block_rows in rows}
-        if len(rows) > 1
+        {f"{share[block_rows].min():.2g} to {share[block_rows].max():.2g}": block_rows for block_rows in masks}
+        if len(masks) > 1
         else {}
     )
 
@@ -94,7 +94,8 @@ def parts_over_time(runs: Runs) -> Columns:
 
 def parts_of_runs(runs: Runs) -> Columns:
     """Label → mask of its rows, for each part of each run over time."""
-    names, parts = runs.run_names, parts_over_time(runs)
+    names = runs.run_names
+    parts = parts_over_time(runs)
     return {f"{run} {label}": (names == run) & part for run in np.unique(names) for label, part in parts.items()}
 
 
@@ -115,13 +116,13 @@ def blocks_of_kind(runs: Runs, by: str) -> Columns:
         return {}  # the same blocks as `voltage`
     values = {c: group_into_levels(runs[c]) if c in GRADED else runs[c] for c in columns}
     labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])
-    changes = rows_of_varying_runs(runs, BLOCKS[by])
-    if changes.all() and by != "run":
+    is_varying = rows_of_varying_runs(runs, BLOCKS[by])
+    if is_varying.all() and by != "run":
         return {}
-    labels = np.where(changes, np.char.add("run ", runs.run_names.astype(str)), labels)
+    labels = np.where(is_varying, np.char.add("run ", runs.run_names.astype(str)), labels)
     names = list(dict.fromkeys(labels))
-    single = by == "run" and len(names) == len(runs)  # each row is a run of its own
-    return {name: labels == name for name in names} if len(names) > 1 and not single else {}
+    rows_are_runs = by == "run" and len(names) == len(runs)  # each row is a run of its own
+    return {name: labels == name for name in names} if len(names) > 1 and not rows_are_runs else {}
 
 
 def distinct_held_out_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Columns]:
@@ -142,13 +143,15 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
     """
     names = runs.configurations_named(problem.base)
     coordinates = problem.coordinates
-    informs = [{_configuration_of_parameter(name, names)} for name in coordinates.names]
+    configurations_informing = [{_configuration_of_parameter(name, names)} for name in coordinates.names]
     for follower, k, _ in coordinates.tied:
-        informs[k].add(_configuration_of_parameter(follower, names))
-    owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
+        configurations_informing[k].add(_configuration_of_parameter(follower, names))
+    rows_of_parameters = [np.isin(names, list(owners)) for owners in configurations_informing if "" not in owners]
     kinds = {}
     for kind, blocks in distinct_held_out_blocks(runs, problem.observe.blocks).items():
-        kinds[kind] = {label: m for label, m in blocks.items() if not any(m[rows].all() for rows in owned)}
+        kinds[kind] = {
+            label: m for label, m in blocks.items() if not any(m[rows].all() for rows in rows_of_parameters)
+        }
     return {kind: blocks for kind, blocks in kinds.items() if blocks}
 
 
@@ -260,21 +263,26 @@ def predict_unseen(
     """
     if not problem.observe.long:
         return hold_out_blocks(problem, start, masks, active)
-    data, z = problem.data, np.asarray(start)
+    data = problem.data
+    z = np.asarray(start)
     residual, jacobian, observation = problem.observe.at(problem, z, active)
     residual, jacobian, reading = np.asarray(residual), np.asarray(jacobian), np.asarray(observation.reading)
     scale = np.asarray(data.weight / data.sd)
-    count, size = scale.shape[1], scale.size
+    count = scale.shape[1]
+    size = scale.size
     slopes = jacobian[:size].reshape(*scale.shape, -1)
     with np.errstate(invalid="ignore", divide="ignore"):
         per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
     steps = []
-    promised = -np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+    full_step = -np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
     for mask in _padded_masks(problem, masks):
-        kept_rows = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
-        j = jacobian[kept_rows]
-        steps.append(-np.linalg.solve(j.T @ j, j.T @ residual[kept_rows]) - promised)
-    readings, statuses = [reading + per_unit @ step for step in steps], [np.asarray(observation.status)] * len(masks)
+        is_kept = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
+        kept_jacobian = jacobian[is_kept]
+        steps.append(
+            -np.linalg.solve(kept_jacobian.T @ kept_jacobian, kept_jacobian.T @ residual[is_kept]) - full_step
+        )
+    readings = [reading + per_unit @ step for step in steps]
+    statuses = [np.asarray(observation.status)] * len(masks)
     return _predictions(problem, masks, readings, statuses, z + np.stack(steps), np.ones(len(masks), bool))
 
 
@@ -286,11 +294,11 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
         start: its optimum.
         masks: kind → label → mask, from `blocks_of_kind`. Kinds without blocks are missing in the result.
     """
-    answers = {}
+    fits_of_kind = {}
     fits: dict[tuple[bytes, ...], HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
     for kind, blocks in masks.items():
         if blocks:
             parts = tuple(m.tobytes() for m in blocks.values())
             fits[parts] = fits.get(parts) or hold_out_blocks(problem, start, list(blocks.values()))
-            answers[kind] = dataclasses.replace(fits[parts], labels=tuple(blocks))
-    return answers
+            fits_of_kind[kind] = dataclasses.replace(fits[parts], labels=tuple(blocks))
+    return fits_of_kind

@@ -51,8 +51,8 @@ def unused_columns(runs: Runs) -> Names:
     for name, cells in runs.extras.items():
         if cells.dtype.kind == "f" and not TIMES.search(name):
             levels = np.unique(cells[np.isfinite(cells)])
-            counts = len(levels) == len(cells) and bool((np.diff(levels) == 1).all())
-            unused += [name] if len(levels) > 1 and not counts else []
+            is_row_number = len(levels) == len(cells) and bool((np.diff(levels) == 1).all())
+            unused += [name] if len(levels) > 1 and not is_row_number else []
     return tuple(unused)
 
 
@@ -74,19 +74,23 @@ def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
     if speed is None or runs.sampled:
         return ()
     total = unexplained = 0.0
-    torque, way = runs[column], np.sign(applied_drive(runs))
-    read = np.isfinite(torque) & np.isfinite(speed)
+    torque = runs[column]
+    way = np.sign(applied_drive(runs))
+    is_read = np.isfinite(torque) & np.isfinite(speed)
     for name in np.unique(runs["configuration"]):
-        of_configuration = read & (runs["configuration"] == name)
-        if of_configuration.sum() >= 4:
-            y, w, d = (
-                torque[of_configuration],
-                np.abs(speed[of_configuration]),
-                way[of_configuration],
+        in_configuration = is_read & (runs["configuration"] == name)
+        if in_configuration.sum() >= 4:
+            torques, speeds, directions = (
+                torque[in_configuration],
+                np.abs(speed[in_configuration]),
+                way[in_configuration],
             )  # a meter may show only magnitudes
-            unexplained += min(_unexplained_torque(y, w, d), _unexplained_torque(np.abs(y), w, np.abs(d)))
-            total += float(np.sum((y - y.mean()) ** 2))
-    if unexplained <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[read] ** 2)):
+            unexplained += min(
+                _unexplained_torque(torques, speeds, directions),
+                _unexplained_torque(np.abs(torques), speeds, np.abs(directions)),
+            )
+            total += float(np.sum((torques - torques.mean()) ** 2))
+    if unexplained <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[is_read] ** 2)):
         return ()
     return (
         Remark(
@@ -103,7 +107,8 @@ def _unexplained_torque(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) 
     """Sum of squared residuals of a torque after fitting a load M_0 sign ω + K ω + M_c with M_0, K ≥ 0.
 
     `speed`: magnitudes of ω. `way`: its signs."""
-    w, ones = speed / max(float(speed.max()), 1e-12), np.ones(len(speed))
+    w = speed / max(float(speed.max()), 1e-12)
+    ones = np.ones(len(speed))
     return float(nnls(np.stack([way, way * w, ones, -ones], 1), torque)[1] ** 2)
 
 
@@ -115,18 +120,18 @@ RANGE = 8.0
 
 
 def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> Remark | None:
-    """Remark that readings and predictions are the same in all rows, to within the noise.
+    """Remark on a table whose readings and predictions are the same in all rows, to within the noise.
 
     None if a channel differs by more, or if the robot of the file does not reach some row.
     """
     if len(runs) < 2 or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return None
-    foreseen = operating_readings(robot, runs.conditions(robot))
-    is_read = np.isfinite(foreseen) & np.isfinite(runs.measured()) & np.isfinite(noise.sd)
+    predicted = operating_readings(robot, runs.conditions(robot))
+    is_read = np.isfinite(predicted) & np.isfinite(runs.measured()) & np.isfinite(noise.sd)
     if not is_read.all():
         return None
     sd = np.median(noise.sd, 0)
-    if (np.ptp(foreseen, 0) >= sd).any() or (np.ptp(runs.measured(), 0) >= RANGE * sd).any():
+    if (np.ptp(predicted, 0) >= sd).any() or (np.ptp(runs.measured(), 0) >= RANGE * sd).any():
         return None
     return Remark(
         "nothing_varies",
@@ -139,15 +144,16 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> Remark | None:
 
 def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
     """Remarks on channels that are a linear function of another channel in all rows, to the digits of the file."""
-    copied, copies = list[Remark](), set[str]()
+    remarks = list[Remark]()
+    copied_names = set[str]()
     for one, other in itertools.combinations(runs.present_channels, 2):
-        if {one.name, other.name} & copies:
+        if {one.name, other.name} & copied_names:
             continue
         x, y = np.asarray(runs[one.column], float), np.asarray(runs[other.column], float)
         if (line := line_through(x, y)) is not None:
-            copies.add(other.name)
+            copied_names.add(other.name)
             same_unit = one.unit_si == other.unit_si
-            copied.append(
+            remarks.append(
                 Remark(
                     "copied",
                     source=runs.source,
@@ -158,7 +164,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
                     tied=same_unit or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest),
                 )
             )
-    return copied
+    return remarks
 
 
 # --- checks -------------------------------------------------------------------------------------
@@ -174,11 +180,11 @@ def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> 
     """
     present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
     for name in names:
-        word = name.split(".")[0]
-        if word in robot.configurations and word not in present:
+        configuration = name.split(".")[0]
+        if configuration in robot.configurations and configuration not in present:
             raise BadConfiguration(
-                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; "
-                f"add {word} runs or leave it fixed"
+                f"--free {name}: {runs.source} has no {configuration} rows, so nothing measures it; "
+                f"add {configuration} runs or leave it fixed"
             )
     _check_enough_readings(runs, names, noise)
     _check_motion(runs, noise)
@@ -213,7 +219,9 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
         if driven and scatter <= WHITE * float(np.nanmax(noise.sd[:, k])) / channel.factor:
             return
     imposed, (_, channel) = runs.layout.imposed_column, speeds[0]
-    size, name, unit = f"{float(f'{scatter:.2g}'):g}", channel.name, channel.unit
+    size = f"{float(f'{scatter:.2g}'):g}"
+    name = channel.name
+    unit = channel.unit
     if driven:
         raise BadData(
             f"{runs.source} rows 1 to {len(runs)}, {channel.column}: readings are noise about zero ({size} "
@@ -226,17 +234,17 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
 
 
 def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> None:
-    levels = int(noise.estimated.sum())
+    estimated_count = int(noise.estimated.sum())
     readings = int(np.isfinite(runs.measured()).sum())
     channels_with_readings = sum(word != "no readings" for word in noise.source)
-    needed = max(2, -(-(len(names) + levels) // max(channels_with_readings, 1)) + (levels > 0))
+    needed = max(2, -(-(len(names) + estimated_count) // max(channels_with_readings, 1)) + (estimated_count > 0))
     if readings >= needed * channels_with_readings:
         return
-    also = f" and estimate {levels} noise levels" if levels else ""
-    cure = "fix some with --fix, or set --noise" if levels else "fix some with --fix"
+    also = f" and estimate {estimated_count} noise levels" if estimated_count else ""
+    cure = "fix some with --fix, or set --noise" if estimated_count else "fix some with --fix"
     is_complete = readings == len(runs) * channels_with_readings
     rows = count_noun(len(runs), "row")
-    have = (
+    present_words = (
         f"{rows} of {channels_with_readings} channels"
         if is_complete
         else f"{count_noun(readings, 'reading')} in {rows}"
@@ -244,7 +252,8 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
     needed_words = f"{needed} rows" if is_complete else f"{needed * channels_with_readings} readings"
     problem_words = f"cannot fit {count_noun(len(names), 'parameter')}{also}" if names else "cannot be fitted"
     raise BadData(
-        f"{runs.source}: {have} {problem_words}; at least {needed_words} are needed{f', or {cure}' if names else ''}"
+        f"{runs.source}: {present_words} {problem_words}; at least {needed_words} are needed"
+        f"{f', or {cure}' if names else ''}"
     )
 
 
@@ -254,34 +263,34 @@ def _check_stuck_channels(runs: Runs) -> list[Remark]:
     """
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.observer_kind(runs).axes_of(runs), *labels) if runs.has(c)]
-    varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
-    stiff: list[Remark] = []
-    if len(np.unique(np.stack(varied, 1), axis=0)) < 2:
-        return stiff
+    condition_levels = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
+    remarks: list[Remark] = []
+    if len(np.unique(np.stack(condition_levels, 1), axis=0)) < 2:
+        return remarks
     for channel in runs.channels:
         readings = (
             runs[channel.column][np.isfinite(runs[channel.column])] if runs.has(channel.column) else np.zeros(0)
         )
         if len(readings) > 2 and np.ptp(readings) == 0:
             if channel.name == "motor_voltage":
-                stiff.append(Remark("stiff_supply", column=channel.column, value=float(readings[0])))
+                remarks.append(Remark("stiff_supply", column=channel.column, value=float(readings[0])))
                 continue
             raise BadData(
                 f"{runs.source}, {channel.column}: {readings[0]:g} in every row although conditions vary; "
                 f"{'nothing moved, ' * channel.zero_at_rest}the instrument was stuck or the column is a copy"
             )
-    return stiff
+    return remarks
 
 
 def _constant_conditions(runs: Runs) -> list[Remark]:
     imposed = runs.layout.imposed_column
-    alike = {
+    indistinguishable_losses = {
         "slope_deg": "guides" if runs.layout.complete else "slope",
         imposed: "voltage" if imposed == SUPPLY else "speed",  # and levels of current identify friction by speed
     }
     return [
         Remark("constant", column=column, value=runs[column][0], alike=losses)
-        for column, losses in alike.items()
+        for column, losses in indistinguishable_losses.items()
         if column in runs.axes
         and np.ptp(runs[column]) == 0
         and (column != SUPPLY or np.ptp(applied_drive(runs)) == 0)
@@ -289,32 +298,34 @@ def _constant_conditions(runs: Runs) -> list[Remark]:
 
 
 def infeasible_error(
-    runs: Runs, robot: Robot, status: np.ndarray, lost: np.ndarray, names: Sequence[str]
+    runs: Runs, robot: Robot, status: np.ndarray, is_unreached: np.ndarray, names: Sequence[str]
 ) -> BadConfiguration:
     """Error message for rows that the model cannot reproduce even at the best point of all searches.
 
     Args:
         robot: robot at the best point.
         status: status of each row, shape (rows,).
-        lost: True for rows that are not reached, shape (rows,).
+        is_unreached: True for rows that are not reached, shape (rows,).
         names: names of the free parameters.
     """
 
-    def listed(which: np.ndarray) -> str:
-        return ", ".join(str(k + 1) for k in np.flatnonzero(which))
+    def listed(mask: np.ndarray) -> str:
+        return ", ".join(str(k + 1) for k in np.flatnonzero(mask))
 
-    slides = lost & (status == SLIDES)
-    if not slides.any():
-        words = ", ".join(STATUSES[k] for k in np.unique(status[lost]))
+    is_sliding = is_unreached & (status == SLIDES)
+    if not is_sliding.any():
+        words = ", ".join(STATUSES[k] for k in np.unique(status[is_unreached]))
         return BadConfiguration(
-            f"no start is feasible: the model has no result in {runs.source} rows {listed(lost)} ({words} at "
+            f"no start is feasible: the model has no result in {runs.source} rows {listed(is_unreached)} ({words} at "
             "best); check their conditions, or widen the priors"
         )
-    sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)
-    parameter = {c: f"{c}.ground.friction.static" for c in sliding}
-    frictions = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
+    sliding_configurations = sorted(set(runs.configurations_named(robot)[is_sliding]), key=robot.configurations.index)
+    parameter = {c: f"{c}.ground.friction.static" for c in sliding_configurations}
+    frictions = ", ".join(
+        f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding_configurations
+    )
     cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"
     return BadConfiguration(
-        f"no start is feasible: {runs.source} rows {listed(slides)} were steady, but the model slides there "
+        f"no start is feasible: {runs.source} rows {listed(is_sliding)} were steady, but the model slides there "
         f"({' and '.join(parameter.values())} = {frictions} cannot carry the demand); {cure}"
     )

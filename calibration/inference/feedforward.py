@@ -152,33 +152,34 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     log, lag, remarks = _speed_from_position(log)
     windows = _motion_windows(log, 0.0)
     if len(windows["u"]) < WINDOWS:
-        lacking = f"; missing: {', '.join(missing)}" if missing else ""
+        missing_words = f"; missing: {', '.join(missing)}" if missing else ""
         raise BadData(
             f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected SysId's four "
-            f"tests{lacking}"
+            f"tests{missing_words}"
         )
     if _fit_constants(windows, "simple")[0][1] < 0:
         remarks.append(Remark("feedforward_sign"))
         log = dataclasses.replace(log, voltage=-log.voltage)
-    delay, windows, level, bend = _fit_delay_and_slope_change(log, mechanism)
+    delay, windows, limit_level, bend = _fit_delay_and_slope_change(log, mechanism)
     if delay > LATE * _median_time_step(log):
         remarks.append(Remark("feedforward_delay", delay=delay))
     else:
         delay = 0.0
-    if level:
+    if limit_level:
         largest_current = None if log.current is None else float(np.nanmax(np.abs(log.current)))
-        limited = Remark("feedforward_limit", level=level, current=largest_current)
-        remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
-        windows = {key: x[windows["demand"] < level] for key, x in windows.items()}
+        limited = Remark("feedforward_limit", level=limit_level, current=largest_current)
+        remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=limit_level))
+        windows = {key: x[windows["demand"] < limit_level] for key, x in windows.items()}
     values, covariance, _ = _fit_constants(windows, mechanism)
-    sds = np.sqrt(np.diag(covariance))
-    constants, spread = (dict(zip(CONSTANTS, x.tolist(), strict=False)) for x in (values, sds))
+    sd_values = np.sqrt(np.diag(covariance))
+    constants, sds = (dict(zip(CONSTANTS, x.tolist(), strict=False)) for x in (values, sd_values))
     if mechanism == "simple":
         # A constant voltage beside friction is half the difference of both directions.
         with_bias, variances, _ = _fit_constants(windows, "elevator")
-        half, sd = with_bias[3], np.sqrt(variances[3, 3])
-        forward, backward = float(with_bias[0] + half), float(with_bias[0] - half)
-        if {*np.sign(windows["s"])} == {1.0, -1.0} and abs(half) > 4 * sd and abs(half) > 0.05 * abs(with_bias[0]):
+        bias = with_bias[3]
+        sd = np.sqrt(variances[3, 3])
+        forward, backward = float(with_bias[0] + bias), float(with_bias[0] - bias)
+        if {*np.sign(windows["s"])} == {1.0, -1.0} and abs(bias) > 4 * sd and abs(bias) > 0.05 * abs(with_bias[0]):
             remarks.append(Remark("feedforward_direction", forward=forward, backward=backward))
     if log.battery is not None and np.isfinite(log.battery).any():
         highest, lowest = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
@@ -186,10 +187,10 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
             remarks.append(Remark("feedforward_sag", rest=highest, low=lowest))
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
-    share = Z95 * spread["kA"] / constants["kA"]
-    if not (determined := 0 < share < 0.5):
-        slow = [t for t in missing if t.startswith("dynamic")]
-        remarks.append(Remark("feedforward_no_kA", share=abs(share), missing=slow))
+    kA_interval_share = Z95 * sds["kA"] / constants["kA"]
+    if not (determined := 0 < kA_interval_share < 0.5):
+        missing_dynamic = [t for t in missing if t.startswith("dynamic")]
+        remarks.append(Remark("feedforward_no_kA", share=abs(kA_interval_share), missing=missing_dynamic))
     tolerances_used = tolerances or Tolerances()
     if tolerances_used.delay is None:
         tolerances_used = dataclasses.replace(tolerances_used, delay=delay + lag)
@@ -202,9 +203,10 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
                               prompt=prompt["velocity_kP"]))  # fmt: skip
     integrals = {"voltage_V": "u", "velocity": "x", "acceleration": "dv", "direction": "s"}
     means = {name: windows[key] / windows["T"] for name, key in integrals.items()}
-    figures = {"run": windows["run"], **means, "quasistatic": windows["quasistatic"]}
+    window_columns = {"run": windows["run"], **means, "quasistatic": windows["quasistatic"]}
     return Feedforward(
-        mechanism, log.unit, constants, spread, gains, tolerances_used, delay, lag, missing, figures, tuple(remarks)
+        mechanism, log.unit, constants, sds, gains, tolerances_used, delay, lag, missing, window_columns,
+        tuple(remarks),
     )  # fmt: skip
 
 
@@ -214,28 +216,35 @@ def feedback_gains(kV: float, kA: float, tolerances: Tolerances) -> dict[str, fl
     As in WPILib: state cost 1/q², effort cost 1/r², voltage held over a period, and K (A - B K)^(delay / period) for
     a delay (`FeedbackAnalysis.cpp` and `LinearQuadraticRegulator::LatencyCompensate` of wpilibsuite/allwpilib).
     """
-    t = tolerances
-    speed = _lqr_gains(np.array([[-kV / kA]]), np.array([[1 / kA]]), [t.velocity], t)
-    place = _lqr_gains(np.array([[0, 1], [0, -kV / kA]]), np.array([[0], [1 / kA]]), [t.position, t.velocity], t)
-    return {"velocity_kP": speed[0], "position_kP": place[0], "position_kD": place[1]}
+    velocity_gains = _lqr_gains(np.array([[-kV / kA]]), np.array([[1 / kA]]), [tolerances.velocity], tolerances)
+    position_gains = _lqr_gains(
+        np.array([[0, 1], [0, -kV / kA]]),
+        np.array([[0], [1 / kA]]),
+        [tolerances.position, tolerances.velocity],
+        tolerances,
+    )
+    return {"velocity_kP": velocity_gains[0], "position_kP": position_gains[0], "position_kD": position_gains[1]}
 
 
-def _lqr_gains(a: np.ndarray, b: np.ndarray, tolerated: list[float], t: Tolerances) -> list[float]:
+def _lqr_gains(a: np.ndarray, b: np.ndarray, tolerated: list[float], tolerances: Tolerances) -> list[float]:
     n = len(a)
-    discrete_system = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * t.period)
+    discrete_system = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * tolerances.period)
     a, b = discrete_system[:n, :n], discrete_system[:n, n:]
-    cost, effort = np.diag(1 / np.square(tolerated)), np.array([[1 / t.effort**2]])
-    p = scipy.linalg.solve_discrete_are(a, b, cost, effort)
-    k = np.linalg.solve(effort + b.T @ p @ b, b.T @ p @ a)
-    later = scipy.linalg.fractional_matrix_power(a - b @ k, (t.delay or 0.0) / t.period)
-    return [float(x) for x in np.real(k @ later)[0]]
+    cost = np.diag(1 / np.square(tolerated))
+    effort = np.array([[1 / tolerances.effort**2]])
+    riccati = scipy.linalg.solve_discrete_are(a, b, cost, effort)
+    gains = np.linalg.solve(effort + b.T @ riccati @ b, b.T @ riccati @ a)
+    transition_over_delay = scipy.linalg.fractional_matrix_power(
+        a - b @ gains, (tolerances.delay or 0.0) / tolerances.period
+    )
+    return [float(x) for x in np.real(gains @ transition_over_delay)[0]]
 
 
 def missing_tests(log: DriveLog) -> Names:
     """SysId tests that a log lacks. Empty if the voltage is neither a ramp nor a step."""
     present = set()
     for name in dict.fromkeys(log.run.tolist()):
-        test_name = next((t for t, old in TESTS.items() if t in name or old in name), None)
+        test_name = next((t for t, log_name in TESTS.items() if t in name or log_name in name), None)
         u = _driven_voltages(log.voltage[log.run == name])
         if test_name is None and len(u) > WINDOWS:
             rises = np.mean(np.diff(np.abs(u)) >= 0) > 0.95
@@ -256,22 +265,24 @@ def _speed_from_position(log: DriveLog) -> tuple[DriveLog, float, list[Remark]]:
     """Log whose speed is the derivative of its position, the lag of its recorded speed [s], and remarks."""
     if log.position is None:
         return log, 0.0, []
-    step, rate = _median_time_step(log), np.zeros(len(log.time))
+    step = _median_time_step(log)
+    rate = np.zeros(len(log.time))
     for rows in _rows_of_runs(log):
         t, x = log.time[rows], log.position[rows]
         rate[rows] = np.nan  # at the ends
         rate[rows[1:-1]] = (x[2:] - x[:-2]) / np.maximum(t[2:] - t[:-2], 1e-9)
     if log.velocity is None:
         return dataclasses.replace(log, velocity=rate), 0.0, []
-    remarks, speed = [], log.velocity
+    remarks = []
+    speed = log.velocity
     moving = np.abs(rate) > 0.2 * np.nanmax(np.abs(rate))
     ratio = float(np.median(speed[moving] / rate[moving])) if moving.any() else 1.0
     if ratio < 0:
         remarks.append(Remark("feedforward_speed_sign"))
     if abs(abs(ratio) - 1) > 0.05:
-        near = min(WRONG_UNITS, key=lambda f: abs(np.log(abs(ratio) / f)))
-        is_close = abs(np.log(abs(ratio) / near)) < 0.03
-        remarks.append(Remark("feedforward_unit", ratio=abs(ratio), near=near if is_close else 0.0))
+        nearest = min(WRONG_UNITS, key=lambda f: abs(np.log(abs(ratio) / f)))
+        is_close = abs(np.log(abs(ratio) / nearest)) < 0.03
+        remarks.append(Remark("feedforward_unit", ratio=abs(ratio), near=nearest if is_close else 0.0))
         speed = speed / abs(ratio)
     speed = speed * np.sign(ratio)
     lags = np.arange(0, LONGEST, step / 4)
@@ -297,27 +308,45 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
     speed dv.
     """
     windows = []
-    step, speeds = _median_time_step(log), np.asarray(log.velocity)
+    step = _median_time_step(log)
+    speeds = np.asarray(log.velocity)
     smallest_speed = MOVES * np.nanmax(np.abs(speeds))
     count = max(FEWEST, round(WINDOW / step))
     for rows in _rows_of_runs(log):
         t, u, v = log.time[rows], log.voltage[rows], speeds[rows]
         voltage_integral = np.r_[0, np.cumsum(u[:-1] * np.diff(t))]
         path = np.r_[0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(t))] if log.position is None else log.position[rows]
-        instants = t - delay
+        drive_times = t - delay
         rests = not abs(v[0]) >= smallest_speed  # a test begins without voltage
-        driven = np.interp(instants, t, voltage_integral) + np.minimum(instants - t[0], 0) * (0.0 if rests else u[0])
-        driven += np.maximum(instants - t[-1], 0) * u[-1]
-        place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
+        drive_integral = np.interp(drive_times, t, voltage_integral) + np.minimum(drive_times - t[0], 0) * (
+            0.0 if rests else u[0]
+        )
+        drive_integral += np.maximum(drive_times - t[-1], 0) * u[-1]
+        angle = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
         ramp = _is_ramp(_driven_voltages(u))
-        inside = np.arange(len(t) - count)[:, None] + np.arange(count + 1)
-        signs, longest = np.sign(v[inside]), max(3 * WINDOW, 2 * count * step)
-        moves = (signs == signs[:, :1]).all(1) & (np.abs(v[inside]).min(1) > smallest_speed)
-        inside = inside[moves & (np.ptp(t[inside], axis=1) <= longest)]
-        u, x, dv, length = (signal[inside[:, -1]] - signal[inside[:, 0]] for signal in (driven, path, v, t))
-        c, s = (length * f(place[inside]).mean(1) for f in (np.cos, np.sin))
-        same = [np.full(len(u), value) for value in (log.run[rows[0]], count, ramp)]
-        windows.append((*same, rows[inside[:, 0]], u, x, dv, length, np.sign(v[inside[:, 0]]) * length, c, s))
+        rows_of_windows = np.arange(len(t) - count)[:, None] + np.arange(count + 1)
+        signs = np.sign(v[rows_of_windows])
+        longest = max(3 * WINDOW, 2 * count * step)
+        moves = (signs == signs[:, :1]).all(1) & (np.abs(v[rows_of_windows]).min(1) > smallest_speed)
+        rows_of_windows = rows_of_windows[moves & (np.ptp(t[rows_of_windows], axis=1) <= longest)]
+        u, x, dv, length = (
+            signal[rows_of_windows[:, -1]] - signal[rows_of_windows[:, 0]] for signal in (drive_integral, path, v, t)
+        )
+        cosine, sine = (length * f(angle[rows_of_windows]).mean(1) for f in (np.cos, np.sin))
+        labels = [np.full(len(u), value) for value in (log.run[rows[0]], count, ramp)]
+        windows.append(
+            (
+                *labels,
+                rows[rows_of_windows[:, 0]],
+                u,
+                x,
+                dv,
+                length,
+                np.sign(v[rows_of_windows[:, 0]]) * length,
+                cosine,
+                sine,
+            )
+        )
     keys = "run", "count", "quasistatic", "row", "u", "x", "dv", "T", "s", "cos", "sin"
     return {key: np.concatenate(parts) for key, parts in zip(keys, zip(*windows, strict=True), strict=True)}
 
@@ -344,26 +373,28 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
     Windows overlap, so the covariance allows for correlated residuals.
     """
     matrix = _regression_matrix(w, mechanism)
-    solved, *_ = np.linalg.lstsq(matrix, w["dv"], rcond=None)
-    acceleration_error = w["dv"] - matrix @ solved
+    coefficients, *_ = np.linalg.lstsq(matrix, w["dv"], rcond=None)
+    speed_change_error = w["dv"] - matrix @ coefficients
     inverse = np.linalg.pinv(matrix.T @ matrix)
     leverage = np.einsum("ij,jk,ik->i", matrix, inverse, matrix)
-    scored = matrix * (acceleration_error / np.maximum(1 - leverage, 0.05))[:, None]
-    middle = scored.T @ scored
+    scores = matrix * (speed_change_error / np.maximum(1 - leverage, 0.05))[:, None]
+    score_covariance = scores.T @ scores
     for lag in range(1, w["count"][0] + 1):  # weights of Newey and West (1987)
-        near = (w["row"][lag:] - w["row"][:-lag] == lag) & (w["run"][lag:] == w["run"][:-lag])
-        lagged_product = (scored[lag:] * near[:, None]).T @ scored[:-lag]
-        middle += (1 - lag / (w["count"][0] + 1)) * (lagged_product + lagged_product.T)
-    spread = inverse @ middle @ inverse
+        is_neighbour = (w["row"][lag:] - w["row"][:-lag] == lag) & (w["run"][lag:] == w["run"][:-lag])
+        lagged_product = (scores[lag:] * is_neighbour[:, None]).T @ scores[:-lag]
+        score_covariance += (1 - lag / (w["count"][0] + 1)) * (lagged_product + lagged_product.T)
+    coefficient_covariance = inverse @ score_covariance @ inverse
 
     def constants(x: np.ndarray) -> np.ndarray:
         gravity = x[3:] if mechanism != "arm" else [np.sqrt(x[3] ** 2 + x[4] ** 2)]
         return np.array([x[1], x[2], 1.0, *gravity]) / x[0]
 
     step = 1e-30  # in the imaginary direction, which gives exact derivatives (Squire and Trapp, SIAM Rev. 40 (1998))
-    derivatives = np.stack([constants(solved + 1j * step * unit).imag / step for unit in np.eye(len(solved))], 1)
-    covariance = derivatives @ spread @ derivatives.T
-    return constants(solved), covariance, float(acceleration_error @ acceleration_error)
+    derivatives = np.stack(
+        [constants(coefficients + 1j * step * unit).imag / step for unit in np.eye(len(coefficients))], 1
+    )
+    covariance = derivatives @ coefficient_covariance @ derivatives.T
+    return constants(coefficients), covariance, float(speed_change_error @ speed_change_error)
 
 
 def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, Columns, float, float]:
@@ -398,23 +429,27 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
     A negative change is less acceleration (a current limit), a positive one more (slipping wheels). Sets `demand`.
     """
     values, _, misfit = _fit_constants(w, mechanism)
-    level, bend, cost, material = 0.0, 0.0, np.inf, False
+    level = 0.0
+    bend = 0.0
+    cost = np.inf
+    is_relevant = False
     for _ in range(3):
-        demanded_slope = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
-        w["demand"] = np.abs(demanded_slope)
+        accelerating_voltage = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
+        w["demand"] = np.abs(accelerating_voltage)
         trials = []
         for share in np.linspace(0.15, 0.9, 16):
             limit = share * w["demand"].max()
             above_limit = w["demand"] > limit
             if above_limit.sum() >= 3 and (~above_limit).sum() >= WINDOWS:
-                hinge = np.sign(demanded_slope) * np.maximum(w["demand"] - limit, 0) * w["T"]
-                matrix = np.column_stack([_regression_matrix(w, mechanism), hinge])
+                voltage_above_limit = np.sign(accelerating_voltage) * np.maximum(w["demand"] - limit, 0) * w["T"]
+                matrix = np.column_stack([_regression_matrix(w, mechanism), voltage_above_limit])
                 slope = np.linalg.lstsq(matrix, w["dv"], rcond=None)[0]
                 trials.append((float(np.sum((w["dv"] - matrix @ slope) ** 2)), float(limit), slope))
         if not trials:
             break
         cost, level, slope = min(trials, key=lambda x: x[0])
         above_limit = w["demand"] > level
-        material = misfit - cost > LEAST**2 * np.sum(w["dv"][above_limit] ** 2)
-        bend, values = float(slope[-1] / slope[0]), slope[1:] / slope[0]
-    return level, bend, cost if material else np.inf
+        is_relevant = misfit - cost > LEAST**2 * np.sum(w["dv"][above_limit] ** 2)
+        bend = float(slope[-1] / slope[0])
+        values = slope[1:] / slope[0]
+    return level, bend, cost if is_relevant else np.inf

@@ -69,7 +69,7 @@ class DependentPair(NamedTuple):
 
 
 def determination(name: str, held: bool, pairs: Iterable[DependentPair]) -> Remark:
-    """Remark on whether data determine a parameter.
+    """Remark on the determination of a parameter by the data.
 
     Args:
         held: True if only its prior determines it.
@@ -79,7 +79,7 @@ def determination(name: str, held: bool, pairs: Iterable[DependentPair]) -> Rema
     return Remark("determined", held=held, others=others)
 
 
-# --- whether a fit is adequate --------------------------------------------------------------------------
+# --- adequacy of a fit ----------------------------------------------------------------------------------
 
 
 class AdequacyFinding(NamedTuple):

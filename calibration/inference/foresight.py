@@ -1,4 +1,4 @@
-"""Which parameters a table can determine, before any fit: ratio of posterior to prior sd at the prior mean."""
+"""Parameters that a table can determine, before any fit: ratio of posterior to prior sd at the prior mean."""
 
 from __future__ import annotations
 
@@ -89,80 +89,82 @@ def predict_identifiability(runs: Runs, robot: Robot) -> InformationForecast:
         BadData: data that cannot be used.
         BadConfiguration: no parameter of the robot can be fitted.
     """
-    runs, settled = rows_to_fit(runs, robot, ROWS)
-    ready = prepare_input(runs, robot)
-    observe, robot, table_noise = ready.observe, ready.robot, ready.noise
+    runs, row_remarks = rows_to_fit(runs, robot, ROWS)
+    prepared = prepare_input(runs, robot)
+    observe, robot, table_noise = prepared.observe, prepared.robot, prepared.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     names = priors.loop_parameter_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)
     if not observe.axis:
-        names = tuple(n for n in names if n not in fidelities.unread_parameters("steady", names, runs.turns))
+        names = tuple(name for name in names if name not in fidelities.unread_parameters("steady", names, runs.turns))
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero; give yours with a ±")
     coordinates = priors.parameter_coordinates(robot, names, any_surface=robot.rig.inherits)
-    posed = observers.pose_problem(runs, robot, coordinates, table_noise.sd)
+    problem = observers.pose_problem(runs, robot, coordinates, table_noise.sd)
     z = jnp.zeros(len(names))
-    observation = optimizers.observe_at(posed, z)
-    is_reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~posed.observe.unreachable(
+    observation = optimizers.observe_at(problem, z)
+    is_reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~problem.observe.unreachable(
         np.asarray(observation.status)
     )
-    weight = posed.data.weight * jnp.asarray(is_reached, float)[:, None]
-    about = identifiability.analyse_identifiability(posed.with_data(weight=weight), z)
-    is_prior_bound = identifiability.held_by_prior(about.sd)
-    fields = params.parameters_by_name(robot)
-    width = coordinates.prior_sd
-    estimates = tuple(
+    weight = problem.data.weight * jnp.asarray(is_reached, float)[:, None]
+    analysis = identifiability.analyse_identifiability(problem.with_data(weight=weight), z)
+    is_held_by_prior = identifiability.held_by_prior(analysis.sd)
+    parameters_by_name = params.parameters_by_name(robot)
+    prior_sd = coordinates.prior_sd
+    parameters = tuple(
         ParameterInformation(
-            n,
-            fields[n].spec.unit,
-            float(fields[n].value),
-            float(width[k]),
-            float(about.sd[k]),
-            bool(is_prior_bound[k]),
+            name,
+            parameters_by_name[name].spec.unit,
+            float(parameters_by_name[name].value),
+            float(prior_sd[k]),
+            float(analysis.sd[k]),
+            bool(is_held_by_prior[k]),
         )
-        for k, n in enumerate(names)
+        for k, name in enumerate(names)
     )
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(observation.status))
-    doubts = (*settled, *remarks_with_codes(ready.checked, *DOUBTS))
-    priors_hold = [p.name for p in estimates if p.held]
+    doubts = (*row_remarks, *remarks_with_codes(prepared.table_remarks, *DOUBTS))
+    held_names = [p.name for p in parameters if p.held]
     together = determined_together(
-        posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold
+        posterior_of_coordinates(coordinates, np.asarray(z), analysis.covariance), held_names
     )
-    alike = tuple(about.correlated())
+    correlated_pairs = tuple(analysis.correlated())
     separating = (
-        tuple(_separating_columns(runs, posed, about, alike))
-        if robot.rig.follows_goal and alike
-        else ((),) * len(alike)
+        tuple(_separating_columns(runs, problem, analysis, correlated_pairs))
+        if robot.rig.follows_goal and correlated_pairs
+        else ((),) * len(correlated_pairs)
     )
-    return InformationForecast(estimates, statuses, table_noise.source, alike, together, robot, doubts, separating)
+    return InformationForecast(
+        parameters, statuses, table_noise.source, correlated_pairs, together, robot, doubts, separating
+    )
 
 
 def _separating_columns(
-    runs: Runs, posed: Problem, about: Identifiability, alike: Sequence[tuple[str, str, float]]
+    runs: Runs, problem: Problem, analysis: Identifiability, correlated_pairs: Sequence[tuple[str, str, float]]
 ) -> Iterator[Names]:
     """For each pair, columns that would separate it: with their readings, it is neither correlated nor held by its
     priors.
 
     Each sample is assumed to have such a reading, and its sensitivity is simulated.
     """
-    channels, rig = posed.base.channels, posed.base.rig
+    channels, rig = problem.base.channels, problem.base.rig
     robot_with_all_channels = dataclasses.replace(
-        posed.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE))
+        problem.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE))
     )
     columns = {**{c.column: np.zeros(len(runs)) for c in robot_with_all_channels.channels}, **runs.columns}
     layout = dataclasses.replace(runs.layout, channels=robot_with_all_channels.channels)
     table = dataclasses.replace(runs, columns=columns, layout=layout)
     sd = np.ones((len(runs), len(robot_with_all_channels.channels)))
-    problem = observers.pose_problem(table, robot_with_all_channels, posed.coordinates, sd)
-    linearised = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)))[:2]
+    problem_with_all_channels = observers.pose_problem(table, robot_with_all_channels, problem.coordinates, sd)
+    linearised = optimizers.linearise(problem_with_all_channels, jnp.zeros(len(problem.coordinates)))[:2]
     readings, slopes = (np.asarray(x)[: sd.size].reshape(*sd.shape, *x.shape[1:]) for x in linearised)
     covariances = {}
     for k, channel in enumerate(robot_with_all_channels.channels):
-        size = channel.sd_share * np.sqrt(np.mean(readings[:, k] ** 2))
-        if channel not in channels and size > 0:
-            rows = np.concatenate([about.jacobian, slopes[:, k] / size, np.eye(len(about.sd))])
-            covariances[channel.column] = np.linalg.inv(rows.T @ rows)
-    for first_name, other, _ in alike:
-        pair = [about.names.index(first_name), about.names.index(other)]
+        reading_sd = channel.sd_share * np.sqrt(np.mean(readings[:, k] ** 2))
+        if channel not in channels and reading_sd > 0:
+            jacobian = np.concatenate([analysis.jacobian, slopes[:, k] / reading_sd, np.eye(len(analysis.sd))])
+            covariances[channel.column] = np.linalg.inv(jacobian.T @ jacobian)
+    for one, other, _ in correlated_pairs:
+        pair = [analysis.names.index(one), analysis.names.index(other)]
         separating = []
         for column, covariance in covariances.items():
             sd = np.sqrt(np.diag(covariance)[pair])

@@ -1,4 +1,4 @@
-"""What data and priors tell about each parameter: covariance, rank, profile likelihoods, coverage."""
+"""Information of data and priors on each parameter: covariance, rank and profile likelihoods."""
 
 from __future__ import annotations
 
@@ -105,7 +105,8 @@ def separate_directions(directions: np.ndarray) -> np.ndarray:
     Args:
         directions: orthonormal vectors that span the subspace, shape (directions, parameters).
     """
-    projector, separated = directions.T @ directions, np.zeros_like(directions)
+    projector = directions.T @ directions
+    separated = np.zeros_like(directions)
     for row in separated:
         k = int(np.argmax(np.round(np.diag(projector), 6)))
         row[:] = projector[k] / np.sqrt(projector[k, k])
@@ -122,12 +123,15 @@ def _jacobians(problem: Problem, z: Array) -> tuple[Array, Array]:
 def analyse_identifiability(problem: Problem, z: Array, slope: np.ndarray | None = None) -> Identifiability:
     """Linear analysis of `problem` at coordinates z, from readings and priors only.
 
-    `slope`, if given, replaces the Jacobian of the whitened readings, (rows · channels, parameters). The limit of
-    adhesion is excluded: it is one-sided, so a profile shows it and a standard error cannot.
+    The limit of adhesion is excluded: it is one-sided, so a profile shows it and a standard error cannot.
+
+    Args:
+        slope: Jacobian of the whitened readings, shape (rows · channels, parameters). None: from the model.
     """
     data = problem.data
     if slope is not None:
-        all_slopes, readings = np.concatenate([slope, np.eye(len(z))]), slope
+        all_slopes = np.concatenate([slope, np.eye(len(z))])
+        readings = slope
     elif problem.observe.long:
         jacobian = np.asarray(optimizers.linearise(problem, z)[1])
         all_slopes, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
@@ -153,7 +157,7 @@ def analyse_identifiability(problem: Problem, z: Array, slope: np.ndarray | None
 
 
 def profile_intervals(
-    problem: Problem, z: Array, cost: float, about: Identifiability
+    problem: Problem, z: Array, cost: float, analysis: Identifiability
 ) -> tuple[Float[np.ndarray, "parameters 2"], Bool[np.ndarray, "parameters 2"]]:
     """95 % interval of each parameter [SI] from its profile likelihood: the objective, minimised over all others.
 
@@ -163,26 +167,27 @@ def profile_intervals(
     Each refit starts where the linear analysis expects the other parameters. The ends of an interval are interpolated
     on the signed square root of the rise, which is straight for a linear model.
     """
-    centre, size = np.asarray(z), len(about.names)
+    centre = np.asarray(z)
+    size = len(analysis.names)
     steps = np.concatenate([-np.asarray(PROFILE_STEPS[::-1]), PROFILE_STEPS])
-    pinned = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
-    direction_of = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
-    starts = centre + direction_of[:, None, :] * (pinned - centre[:, None])[..., None]
+    points = centre[:, None] + analysis.sd[:, None] * steps  # (parameters, points)
+    direction_of = analysis.covariance / np.diag(analysis.covariance)[:, None]  # row k: how all move with k
+    starts = centre + direction_of[:, None, :] * (points - centre[:, None])[..., None]
     held = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
     refits = optimizers.fit_with_held(
         problem, jnp.asarray(starts.reshape(-1, size)), jnp.asarray(held.reshape(-1, size))
     )
-    cost_of_held = 0.5 * (pinned - np.asarray(problem.data.centre)[:, None]) ** 2
-    rise = 2 * (np.asarray(refits.cost).reshape(pinned.shape) + cost_of_held - cost)
+    cost_of_held = 0.5 * (points - np.asarray(problem.data.centre)[:, None]) ** 2
+    rise = 2 * (np.asarray(refits.cost).reshape(points.shape) + cost_of_held - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
     middle = len(PROFILE_STEPS)
-    at_all = np.insert(pinned, middle, centre, axis=1)
-    root_all = np.insert(root, middle, 0.0, axis=1)
+    points_with_optimum = np.insert(points, middle, centre, axis=1)
+    root_with_optimum = np.insert(root, middle, 0.0, axis=1)
     # Where the signed root reaches ∓Z95, or the end points if it does not.
-    rising = np.maximum.accumulate(root_all, 1)
-    ends = np.array([np.interp([-Z95, Z95], r, a) for a, r in zip(at_all, rising, strict=True)])
+    rising = np.maximum.accumulate(root_with_optimum, 1)
+    ends = np.array([np.interp([-Z95, Z95], r, a) for a, r in zip(points_with_optimum, rising, strict=True)])
     interval = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(ends.T))).T
-    return interval, np.stack([root_all[:, 0] > -Z95, root_all[:, -1] < Z95], 1)
+    return interval, np.stack([root_with_optimum[:, 0] > -Z95, root_with_optimum[:, -1] < Z95], 1)
 
 
 # --- posteriors of fits ---------------------------------------------------------------------------
@@ -222,18 +227,18 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     value = posterior.at(posterior.mean)
     log = np.array([kind == LOG for kind in posterior.kinds])
     spread = posterior.spread * sd  # of the parameter, or of its logarithm
-    groups = []
+    pairs = []
     for i, j in zip(*np.triu_indices(len(sd), 1), strict=True):
-        first_name, other = posterior.coordinates[i], posterior.coordinates[j]
+        one, other = posterior.coordinates[i], posterior.coordinates[j]
         correlation = float(posterior.covariance[i, j] / max(sd[i] * sd[j], 1e-300))
-        if not abs(correlation) > TOGETHER or (first_name in held and other in held):
+        if not abs(correlation) > TOGETHER or (one in held and other in held):
             continue
         size = spread * np.where(log, value[: len(sd)], 1.0)
         weight = -np.sign(correlation) * abs(size[i] / size[j])
-        even = log[i] and log[j] and 1 / EVEN < spread[i] / spread[j] < EVEN
-        form = "linear" if not even else "ratio" if correlation > 0 else "product"
-        groups.append(DependentPair(first_name, other, correlation, form, float(weight)))
-    return tuple(sorted(groups, key=lambda pair: -abs(pair.correlation)))
+        is_ratio_or_product = log[i] and log[j] and 1 / EVEN < spread[i] / spread[j] < EVEN
+        form = "linear" if not is_ratio_or_product else "ratio" if correlation > 0 else "product"
+        pairs.append(DependentPair(one, other, correlation, form, float(weight)))
+    return tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation)))
 
 
 def undetermined_names(held: Collection[str], pairs: Collection[DependentPair]) -> Names:

@@ -113,7 +113,7 @@ class Residuals:
     z: np.ndarray
 
     @functools.cached_property
-    def taken(self) -> np.ndarray:
+    def absorbed(self) -> np.ndarray:
         """Orthonormal directions in which the free parameters absorb residuals, shape (readings + parameters,
         parameters).
         """
@@ -122,7 +122,7 @@ class Residuals:
     @property
     def freedom(self) -> np.ndarray:
         """Degrees of freedom that the fit leaves in each channel, shape (channels,)."""
-        leverage = np.sum(self.taken[: self.counts.size] ** 2, 1).reshape(self.counts.shape)
+        leverage = np.sum(self.absorbed[: self.counts.size] ** 2, 1).reshape(self.counts.shape)
         return np.sum(np.where(self.counts, 1.0 - leverage, 0.0), 0)
 
     @property
@@ -139,13 +139,15 @@ class Residuals:
         """
         counts = self.counts & np.isfinite(as_stated)
         measured = np.where(counts, self.runs.measured(), np.nan)
-        fitted, before = (share_of_measured(x, measured) for x in (self.simulated, as_stated))
+        relative_errors, relative_errors_as_stated = (
+            share_of_measured(x, measured) for x in (self.simulated, as_stated)
+        )
         sigma = np.sqrt(self.chi2 / np.maximum(self.counts.sum(0), 1))
-        large = (fitted > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
+        large = (relative_errors > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
         return tuple(
-            RelativeError(c.name, float(fitted[k]), float(before[k]), bool(large[k]))
+            RelativeError(c.name, float(relative_errors[k]), float(relative_errors_as_stated[k]), bool(large[k]))
             for k, c in enumerate(self.runs.channels)
-            if np.isfinite(fitted[k])
+            if np.isfinite(relative_errors[k])
         )
 
     def rescaled(self) -> Residuals:
@@ -174,11 +176,11 @@ def judge_adequacy(
     misses = fit.misses(as_stated, ~estimated)
     adequacy = adequacy_of_residuals(fit, known=not estimated.any())
     is_compared = fit.counts & np.isfinite(as_stated)
-    before = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=is_compared)
+    chi2_as_stated = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=is_compared)
     obstacle = (
         "undescribed" if any(m.large for m in misses)
         else "not converged" if not converged
-        else "worse" if np.sum(fit.whitened**2, where=is_compared) > before + WORSE
+        else "worse" if np.sum(fit.whitened**2, where=is_compared) > chi2_as_stated + WORSE
         else ""
     )  # fmt: skip
     adequate = adequacy.adequate if not obstacle else None if obstacle == "not converged" else False
@@ -223,10 +225,11 @@ def _p_value_of_columns(fit: Residuals, columns: np.ndarray, known: bool) -> flo
     padded_columns = np.concatenate([columns, np.zeros((parameters, columns.shape[1]))])
     size = np.linalg.norm(padded_columns, axis=0)
     padded_columns = padded_columns[:, size > 0] / size[size > 0]
-    projected = padded_columns - fit.taken @ (fit.taken.T @ padded_columns)
-    directions, scale, _ = np.linalg.svd(projected, full_matrices=False)
-    directions = directions[:, scale > CLEAR]
-    terms, freedom = directions.shape[1], float(fit.freedom.sum())
+    projected = padded_columns - fit.absorbed @ (fit.absorbed.T @ padded_columns)
+    directions, singular_values, _ = np.linalg.svd(projected, full_matrices=False)
+    directions = directions[:, singular_values > CLEAR]
+    terms = directions.shape[1]
+    freedom = float(fit.freedom.sum())
     if terms == 0 or freedom - terms < LEAST:
         return None
     explained = float(np.sum((directions.T @ np.concatenate([fit.whitened.ravel(), fit.z])) ** 2))
@@ -260,9 +263,9 @@ def _curve_columns(fit: Residuals) -> dict[AdequacyFinding, np.ndarray]:
                 continue
             scaled = 2 * (x - x[rows].min()) / np.ptp(x[rows]) - 1
             curve = legendre.legvander(np.nan_to_num(scaled), min(terms, len(np.unique(x[rows])) - 1))
-            own_curves = [curve * ((configuration == c) & rows)[:, None] for c in np.unique(configuration)]
-            columns = np.zeros((*counts.shape, sum(o.shape[1] for o in own_curves)))
-            columns[:, k] = np.concatenate(own_curves, 1)
+            configuration_curves = [curve * ((configuration == c) & rows)[:, None] for c in np.unique(configuration)]
+            columns = np.zeros((*counts.shape, sum(curves.shape[1] for curves in configuration_curves)))
+            columns[:, k] = np.concatenate(configuration_curves, 1)
             families[AdequacyFinding(channel.name, "follow", name)] = columns.reshape(counts.size, -1)
     return families
 
@@ -272,17 +275,25 @@ def _autocorrelation_tests(fit: Residuals) -> list[tuple[float, AdequacyFinding]
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     if not observe.axis:
         return []
-    run = runs.run_names
-    order = np.lexsort((runs[observe.axis], run))
-    is_same_run = run[order][1:] == run[order][:-1]
+    run_names = runs.run_names
+    order = np.lexsort((runs[observe.axis], run_names))
+    is_same_run = run_names[order][1:] == run_names[order][:-1]
     tests = []
     for k, channel in enumerate(fit.runs.channels):
-        e, ok = residual[order, k], counts[order, k]
-        is_consecutive = is_same_run & ok[1:] & ok[:-1]
-        power = float(np.sum(e[ok] ** 2))
+        residuals_of_channel, is_included = residual[order, k], counts[order, k]
+        is_consecutive = is_same_run & is_included[1:] & is_included[:-1]
+        power = float(np.sum(residuals_of_channel[is_included] ** 2))
         if is_consecutive.sum() >= 20 and power > 0:
-            r = float(np.sum(e[1:][is_consecutive] * e[:-1][is_consecutive])) / power
-            tests.append((float(ndtr(-r * np.sqrt(is_consecutive.sum()))), AdequacyFinding(channel.name, "remember")))
+            autocorrelation = (
+                float(np.sum(residuals_of_channel[1:][is_consecutive] * residuals_of_channel[:-1][is_consecutive]))
+                / power
+            )
+            tests.append(
+                (
+                    float(ndtr(-autocorrelation * np.sqrt(is_consecutive.sum()))),
+                    AdequacyFinding(channel.name, "remember"),
+                )
+            )
     return tests
 
 
@@ -293,18 +304,25 @@ def _replicate_test(fit: Residuals) -> list[tuple[float, AdequacyFinding]]:
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes_of(runs), "surface") if runs.has(c)]
-    past = course_of_each_row(runs).tolist()  # replicates share their past too
-    groups = rows_by_key(zip(past, *(runs[c].astype(str).tolist() for c in columns), strict=True))
-    pure, degrees = 0.0, 0
+    courses = course_of_each_row(runs).tolist()  # replicates share their past too
+    groups = rows_by_key(zip(courses, *(runs[c].astype(str).tolist() for c in columns), strict=True))
+    replicate_chi2, replicate_freedom = 0.0, 0
     for rows in (g for g in groups.values() if len(g) > 1):
         for k in range(counts.shape[1]):
-            e = residual[rows, k][counts[rows, k]]
-            pure += float(np.sum((e - e.mean()) ** 2)) if len(e) > 1 else 0.0
-            degrees += max(len(e) - 1, 0)
-    if degrees < REPLICATES or freedom - degrees < 1 or pure <= 0:
+            replicates = residual[rows, k][counts[rows, k]]
+            replicate_chi2 += float(np.sum((replicates - replicates.mean()) ** 2)) if len(replicates) > 1 else 0.0
+            replicate_freedom += max(len(replicates) - 1, 0)
+    if replicate_freedom < REPLICATES or freedom - replicate_freedom < 1 or replicate_chi2 <= 0:
         return []
-    quotient = max(chi2 - pure, 0.0) / (freedom - degrees) / (pure / degrees)
-    return [(float(fdtrc(freedom - degrees, degrees, quotient)), AdequacyFinding(what="repeats"))]
+    variance_ratio = (
+        max(chi2 - replicate_chi2, 0.0) / (freedom - replicate_freedom) / (replicate_chi2 / replicate_freedom)
+    )
+    return [
+        (
+            float(fdtrc(freedom - replicate_freedom, replicate_freedom, variance_ratio)),
+            AdequacyFinding(what="repeats"),
+        )
+    ]
 
 
 # --- stated sds -----------------------------------------------------------------------------------------

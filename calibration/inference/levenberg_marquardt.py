@@ -27,7 +27,7 @@ SHORTER, LONGER = 0.25, 3.5
 #: Multiple of the objective up to which a rejected point corrects the slope.
 TELLING = 4.0
 #: Most iterations in which the one-sided residuals that are positive at the end of a step are determined.
-TURNS = 8
+ITERATIONS = 8
 #: Largest step that is mixed with the last one [prior sds], and the largest factor of that mixing.
 NEAR, MIXED_MOST = 0.3, 10.0
 
@@ -62,24 +62,27 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
     """
     free = jacobian.at[one_sided].set(0.0)
     normal = free.T @ free + damping * jnp.eye(jacobian.shape[1])
-    gradient, edge, height = free.T @ r, jacobian[one_sided], r[one_sided]
+    gradient = free.T @ r
+    edge = jacobian[one_sided]
+    height = r[one_sided]
 
     def value(d: Array) -> Array:
         return half_squares(r + jacobian @ d, one_sided) + 0.5 * damping * jnp.sum(d**2)
 
     def iterate(carry: tuple) -> tuple:
-        turns, active, _, best, lowest = carry
-        counts = edge * active[:, None]
-        d = -solve(normal + counts.T @ counts, gradient + counts.T @ height)
-        beyond, values = height + edge @ d > 0, value(d)
-        better = values < lowest
-        return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, values, lowest)
+        iterations, active, _, best, lowest = carry
+        active_edges = edge * active[:, None]
+        d = -solve(normal + active_edges.T @ active_edges, gradient + active_edges.T @ height)
+        positive = height + edge @ d > 0
+        objective = value(d)
+        better = objective < lowest
+        return iterations + 1, positive, active, jnp.where(better, d, best), jnp.where(better, objective, lowest)
 
     zero_step = jnp.zeros(jacobian.shape[1])
 
     def has_changed(carry: tuple) -> Array:
-        turns, active, active_before, _, _ = carry
-        return (turns == 0) | (turns < TURNS) & jnp.any(active != active_before)
+        iterations, active, active_before, _, _ = carry
+        return (iterations == 0) | (iterations < ITERATIONS) & jnp.any(active != active_before)
 
     start = jnp.asarray(0), height > 0, height > 0, zero_step, jnp.asarray(jnp.inf)
     return jax.lax.while_loop(has_changed, iterate, start)[3]
@@ -159,10 +162,13 @@ class OneSidedLevenbergMarquardt(eqx.Module):
 
     def begin(self, y: Z, residuals: int, aux: Any) -> SearchState:
         """State of a search before its first evaluation. `aux`: shapes and types of the auxiliary output."""
-        none, no, jacobian = jnp.asarray(0), jnp.asarray(False), jnp.zeros((residuals, y.size), y.dtype)
+        zero = jnp.asarray(0)
+        false = jnp.asarray(False)
+        jacobian = jnp.zeros((residuals, y.size), y.dtype)
         aux = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux)
-        evaluation, still = (jnp.zeros(residuals, y.dtype), jacobian, aux), jnp.zeros_like(y)
-        return SearchState(y, *evaluation, jacobian, still, y, no, jnp.asarray(1.0), none, none, no)
+        evaluation = (jnp.zeros(residuals, y.dtype), jacobian, aux)
+        zero_step = jnp.zeros_like(y)
+        return SearchState(y, *evaluation, jacobian, zero_step, y, false, jnp.asarray(1.0), zero, zero, false)
 
     def step(self, state: SearchState, residual: Array, jacobian: Array, aux: Any) -> SearchState:
         """Accepts or rejects the last step, given the evaluation at its end, and finds the next one.
@@ -172,42 +178,48 @@ class OneSidedLevenbergMarquardt(eqx.Module):
                 auxiliary output.
         """
         one_sided = slice(self.first, self.last)
-        last_step, first = state.ahead - state.y, state.steps == 0
+        last_step = state.ahead - state.y
+        first = state.steps == 0
         objective, objective_before = (half_squares(r, one_sided) for r in (residual, state.residual))
         # A mixed step whose prediction is a rise counts as one of no change.
         predicted = half_squares(state.residual + state.slope @ last_step, one_sided) - objective_before
-        predicted, change = jnp.minimum(predicted, 0.0), objective - objective_before
+        predicted = jnp.minimum(predicted, 0.0)
+        change = objective - objective_before
         accepted = first | (change <= LITTLE * predicted)
-        good = ~first & (change < NEARLY_ALL * predicted) & (predicted < 0)
-        region = state.region * jnp.where(accepted, jnp.where(good, LONGER, 1), SHORTER)
-        alike = jnp.all((residual[one_sided] > 0) == (state.residual[one_sided] > 0))
-        accepted &= first | alike | ~state.mixed
+        is_good = ~first & (change < NEARLY_ALL * predicted) & (predicted < 0)
+        region = state.region * jnp.where(accepted, jnp.where(is_good, LONGER, 1), SHORTER)
+        same_active = jnp.all((residual[one_sided] > 0) == (state.residual[one_sided] > 0))
+        accepted &= first | same_active | ~state.mixed
         region = jnp.where(state.mixed & ~accepted, state.region, region)
         # Converged if an accepted step changed neither y nor any residual that counts by more than the tolerance.
         changed = active_residuals(residual, one_sided) - active_residuals(state.residual, one_sided)
         sizes = (last_step, state.ahead), (changed, residual)
-        moved, change = (jnp.max(jnp.abs(x / (self.tolerance + self.tolerance * jnp.abs(at)))) for x, at in sizes)
+        moved, change = (
+            jnp.max(jnp.abs(x / (self.tolerance + self.tolerance * jnp.abs(reference)))) for x, reference in sizes
+        )
         has_converged = (moved < 1) & (change < 1) & accepted
 
         corrected = state.slope
         if self.rough:
-            least = jnp.finfo(residual.dtype).tiny
-            projection, length = corrected @ last_step, jnp.maximum(last_step @ last_step, least)
+            tiny = jnp.finfo(residual.dtype).tiny
+            projection = corrected @ last_step
+            length = jnp.maximum(last_step @ last_step, tiny)
             missed = residual - state.residual - projection
-            near = (state.steps > 0) & (objective < TELLING * objective_before)
-            corrected = jnp.where(near, corrected + jnp.outer(missed, last_step) / length, corrected)
-            half = jnp.minimum(region, length / jnp.maximum(projection @ projection, least))
-            region = jnp.where(accepted | state.mixed, region, half)
+            is_near = (state.steps > 0) & (objective < TELLING * objective_before)
+            corrected = jnp.where(is_near, corrected + jnp.outer(missed, last_step) / length, corrected)
+            half_region = jnp.minimum(region, length / jnp.maximum(projection @ projection, tiny))
+            region = jnp.where(accepted | state.mixed, region, half_region)
         y, residual, jacobian, aux, slope = jax.tree.map(
             lambda new, old: jnp.where(accepted, new, old),
             (state.ahead, residual, jacobian, aux, jacobian),
             (state.y, state.residual, state.jacobian, state.aux, corrected),
         )
-        tiny = jnp.finfo(region.dtype)
-        damping = jnp.where(region > tiny.eps, 1 / jnp.maximum(region, tiny.eps), tiny.max)
+        number_limits = jnp.finfo(region.dtype)
+        damping = jnp.where(region > number_limits.eps, 1 / jnp.maximum(region, number_limits.eps), number_limits.max)
         stride = one_sided_step(residual, slope, one_sided, damping)
-        mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
+        mixed = accepted & same_active & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
         ahead = y + jnp.where(mixed, mixed_step(stride, last_step, stride - state.stride), stride)
         rejected = jnp.where(accepted, 0, state.rejected + 1)
-        evaluation, is_over = (residual, jacobian, aux), has_converged | (rejected >= PATIENCE)
+        evaluation = (residual, jacobian, aux)
+        is_over = has_converged | (rejected >= PATIENCE)
         return SearchState(y, *evaluation, slope, stride, ahead, mixed, region, state.steps + 1, rejected, is_over)

@@ -52,8 +52,10 @@ def balance_probe(whose: str) -> Effect:
 
 def with_probes(robot: Robot, probes: Sequence[Effect], amplitudes: Sequence[Array] | Array) -> Robot:
     """Robot with further effects, such as probes, at these amplitudes."""
-    put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitudes, strict=True))
-    return dataclasses.replace(robot, effects=(*robot.effects, *put))
+    probes_with_amplitudes = tuple(
+        eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitudes, strict=True)
+    )
+    return dataclasses.replace(robot, effects=(*robot.effects, *probes_with_amplitudes))
 
 
 # --- effects as they are scored -------------------------------------------------------------------------
@@ -126,7 +128,8 @@ class ScoredEffect(eqx.Module):
 
 def with_shape_grid(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
     """Effect with the grid of its shape parameter, clipped at the parameter's bounds."""
-    shape, amplitude = free_shape_parameter(effect), amplitude_of(effect)
+    shape = free_shape_parameter(effect)
+    amplitude = amplitude_of(effect)
     unit = params.replace(effect, {amplitude.name: jnp.asarray(amplitude.spec.prior_sd(0.0))})
     if shape is None:
         return ScoredEffect(unit, "", (0.0,), jnp.zeros(0))
@@ -149,14 +152,14 @@ def with_shape_of_robot(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
     )
 
 
-def map_over_shapes(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
-    """Applies a function to the effect at each point of its grid and to the matching value in `given`, shape
+def map_over_shapes(scored: ScoredEffect, function: Callable[[Effect, Array], Array], inputs: Array) -> Array:
+    """Applies a function to the effect at each point of its grid and to the matching value in `inputs`, shape
     (grid,).
     """
     if not scored.shape:
-        return function(scored.effect, given[0])[None]
-    of_shape = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
-    return jax.vmap(of_shape)(scored.values, given)
+        return function(scored.effect, inputs[0])[None]
+    of_value = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
+    return jax.vmap(of_value)(scored.values, inputs)
 
 
 def _with_memory(signals: Signals, effect: Effect, memory: Array) -> Signals:
@@ -185,10 +188,12 @@ def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ..
         memory: memory of each effect at each point of its grid. Any number for an effect without memory.
     """
 
-    def term(effect: Effect, remembered: Array) -> Array:
-        alone = dataclasses.replace(robot, effects=(effect,))
-        remembering = _with_memory(signals, effect, remembered)
-        return jnp.asarray(balances.effects_sum(alone, remembering, effect.balance, effect.channel), float)
+    def term(effect: Effect, effect_memory: Array) -> Array:
+        robot_with_effect = dataclasses.replace(robot, effects=(effect,))
+        signals_with_memory = _with_memory(signals, effect, effect_memory)
+        return jnp.asarray(
+            balances.effects_sum(robot_with_effect, signals_with_memory, effect.balance, effect.channel), float
+        )
 
     terms = [map_over_shapes(e, term, m) for e, m in zip(effects, memory, strict=True)]
     return jnp.concatenate([jnp.zeros(0), *terms])
@@ -273,7 +278,7 @@ class Linearization(eqx.Module):
         """
         raise NotImplementedError
 
-    def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
+    def channel_columns(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         """Change of the whitened readings by errors of one channel [SI]. Each column is an error over the points.
 
         Args:
@@ -283,7 +288,7 @@ class Linearization(eqx.Module):
         channel_scale = self.scale * (np.arange(self.scale.shape[1]) == channel)
         return (channel_scale[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
-    def places(self) -> np.ndarray:
+    def revealing_rows(self) -> np.ndarray:
         """Indices of the rows in which a single row reveals an error."""
         raise NotImplementedError
 
@@ -293,14 +298,14 @@ class Linearization(eqx.Module):
 
     def curve_variable(self, place: str, variable: str) -> tuple[np.ndarray, np.ndarray]:
         """Variable of a curve in a place [SI] and its factor at each point, as `effects.curve` uses them."""
-        x, way = in_travel_frame(place, variable, self.variable(variable), self.variable, self.magnitudes)
-        return np.asarray(x), np.broadcast_to(way, (self.points,))
+        x, factor = in_travel_frame(place, variable, self.variable(variable), self.variable, self.magnitudes)
+        return np.asarray(x), np.broadcast_to(factor, (self.points,))
 
     def runs(self) -> list[np.ndarray]:
         """Indices of the rows of each run. A settled run has one row."""
         return list(np.arange(self.rows)[:, None])
 
-    def turned(self) -> np.ndarray | None:
+    def shaft_angle(self) -> np.ndarray | None:
         """Angle of the driving shaft in each row since the start of its run [rad]. None for settled runs."""
         return None
 
@@ -308,7 +313,7 @@ class Linearization(eqx.Module):
         """Whitened residuals of each run in order of time. A settled row is a run."""
         return self.by_row()[:, None]
 
-    def memory(self) -> Array:
+    def autocorrelation(self) -> Array:
         """Test of autocorrelation of the residuals, as a normal deviate. -inf if the order of rows has no meaning."""
         return jnp.asarray(-jnp.inf)
 

@@ -59,13 +59,13 @@ class StartOutcomes:
     @property
     def agreement(self) -> Remark:
         """Remark on how well the starts agree."""
-        other = self.converged & ~self._at_best
-        cost_difference = float(self.cost[other].min() - self.cost.min()) if other.any() else 0.0
+        is_elsewhere = self.converged & ~self._at_best
+        cost_difference = float(self.cost[is_elsewhere].min() - self.cost.min()) if is_elsewhere.any() else 0.0
         return Remark(
             "agreement",
             starts=len(self.cost),
             agree=self.agree,
-            elsewhere=int(other.sum()),
+            elsewhere=int(is_elsewhere.sum()),
             more=cost_difference,
             open=int(np.sum(~self.converged)),
         )
@@ -94,7 +94,7 @@ class MultistartResult:
     searched: PopulationSearch | None = None
 
 
-def search_from_starts(posed: Problem, noise: Noise, points: np.ndarray) -> MultistartResult:
+def search_from_starts(problem: Problem, noise: Noise, points: np.ndarray) -> MultistartResult:
     """Searches from all points in one batch. Unknown noise is estimated and the search repeated until the noise
     settles.
 
@@ -103,23 +103,23 @@ def search_from_starts(posed: Problem, noise: Noise, points: np.ndarray) -> Mult
     z = points[0]
     shares = initial_noise_shares(noise)
     for _ in range(ROUNDS):
-        posed, optima, feasible = _search_until_feasible(
-            posed, np.concatenate([points, z[None]]), optimizers.search_starts
+        problem, optima, feasible = _search_until_feasible(
+            problem, np.concatenate([points, z[None]]), optimizers.search_starts
         )
         best = _pick_member(optima, int(np.nanargmin(optima.cost)))
         z = np.asarray(best.z)
-        new = _reestimate_shares(posed, noise, z, shares)
-        if new is None:
+        new_shares = _reestimate_shares(problem, noise, z, shares)
+        if new_shares is None:
             break
-        shares = new
-        posed = with_noise_shares(posed, noise, shares)
+        shares = new_shares
+        problem = with_noise_shares(problem, noise, shares)
     return MultistartResult(
-        posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], optima), feasible[:-1]), shares
+        problem, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], optima), feasible[:-1]), shares
     )
 
 
 def search_one_by_one(
-    posed: Problem,
+    problem: Problem,
     noise: Noise,
     points: np.ndarray,
     shares: np.ndarray,
@@ -131,7 +131,7 @@ def search_one_by_one(
     becomes the optimum and the noise settles again.
 
     Args:
-        posed: problem with the initial noise.
+        problem: problem with the initial noise.
         shares: initial noise, relative to the readings.
         tell: callback for progress after every step.
     """
@@ -140,16 +140,16 @@ def search_one_by_one(
     def elapsed_minutes() -> float:
         return (time.perf_counter() - start_time) / 60
 
-    def step(posed: Problem, points: np.ndarray) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
-        def one(z: np.ndarray) -> tuple[optimizers.Optimum, Observation, Observation]:
+    def search_first(problem: Problem, points: np.ndarray) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
+        def search_from(z: np.ndarray) -> tuple[optimizers.Optimum, Observation, Observation]:
             return optimizers.search_rollout(
-                posed,
+                problem,
                 jnp.asarray(z),
                 tell=lambda *done: tell(progress_remark("search", *done, elapsed_minutes())),
             )
 
-        optima, start, end = one(points[0])
-        optima, end = scans.search_lower_minima(posed, (optima, end), lambda z: one(z)[::2], tell)
+        optima, start, end = search_from(points[0])
+        optima, end = scans.search_lower_minima(problem, (optima, end), lambda z: search_from(z)[::2], tell)
         optima, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (optima, start, end))
         return optima, start.status, end.status
 
@@ -157,19 +157,19 @@ def search_one_by_one(
     for _ in range(len(points)):
         z = first_point
         for round_ in range(1, ROUNDS + 1):
-            posed, optima, feasible = _search_until_feasible(posed, z[None], step)
+            problem, optima, feasible = _search_until_feasible(problem, z[None], search_first)
             z = np.asarray(optima.z[0])
             tell(progress_remark("round", round_, optima.cost[0], optima.steps[0], elapsed_minutes()))
-            new = _reestimate_shares(posed, noise, z, shares)
-            if new is None:
+            new_shares = _reestimate_shares(problem, noise, z, shares)
+            if new_shares is None:
                 break
-            shares = new
-            posed = with_noise_shares(posed, noise, shares)
+            shares = new_shares
+            problem = with_noise_shares(problem, noise, shares)
         ends, feasibles = [optima], [feasible]
         for k, point in enumerate(points[1:], 2):
-            end, status, _ = step(posed, point[None])
+            end, status, _ = search_first(problem, point[None])
             ends.append(end)
-            feasibles.append(~np.any(posed.unreachable_rows(status), axis=1))
+            feasibles.append(~np.any(problem.unreachable_rows(status), axis=1))
             tell(progress_remark("start", k, len(points), end.cost[0], end.steps[0], elapsed_minutes()))
         optima = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
         k = int(np.nanargmin(optima.cost))
@@ -178,18 +178,18 @@ def search_one_by_one(
             break
         first_point = np.asarray(optima.z[k])
     return MultistartResult(
-        posed, _pick_member(optima, k), _outcome_of_searches(optima, np.concatenate(feasibles)), shares
+        problem, _pick_member(optima, k), _outcome_of_searches(optima, np.concatenate(feasibles)), shares
     )
 
 
-def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
+def starts_from_posterior(steady_problem: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
     """Starts of the searches of a rollout, drawn from the posterior of `steady` at its optimum z.
 
     A draw is kept if no row slides and if no friction law is steeper at rest than that of the base. If there are too
     few, the nearest ones are kept. Draws from the prior would need hundreds of rollouts along the limit of adhesion
     to recover. The starts of `steady` already show if the problem has several optima.
     """
-    spread = np.linalg.cholesky(identifiability.analyse_identifiability(easy, jnp.asarray(z)).covariance)
+    spread = np.linalg.cholesky(identifiability.analyse_identifiability(steady_problem, jnp.asarray(z)).covariance)
     draws = z + rng.standard_normal((DRAWS, len(z))) @ spread.T
 
     def steepness(robot: Robot) -> jax.Array:
@@ -197,15 +197,17 @@ def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator
         return jnp.stack([law.static / law.speed_static for law in laws])
 
     def status_and_steepness(z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return easy.observation(z).status, steepness(easy.robot(z)) > 1.001 * steepness(easy.base)
+        return steady_problem.observation(z).status, steepness(steady_problem.robot(z)) > 1.001 * steepness(
+            steady_problem.base
+        )
 
     status, steep = jax.jit(jax.vmap(status_and_steepness))(jnp.asarray(draws))
-    unreachable_count = easy.unreachable_rows(status).sum(1) + np.asarray(steep).sum(1)
+    unreachable_count = steady_problem.unreachable_rows(status).sum(1) + np.asarray(steep).sum(1)
     return draws[np.argsort(unreachable_count, kind="stable")[:count]]
 
 
 def optimum_of_population(
-    posed: Problem,
+    problem: Problem,
     noise: Noise,
     shares: np.ndarray,
     searched: PopulationSearch,
@@ -214,21 +216,23 @@ def optimum_of_population(
     """Result of a population, after a further search by gradients from its best member where gradients are
     reliable.
     """
-    z = searched.found.z[searched.at]
+    z = searched.population.z[searched.best]
     if searched.slope is None:
-        optima = search_one_by_one(posed, noise, z[None], shares, tell)
+        optima = search_one_by_one(problem, noise, z[None], shares, tell)
         return dataclasses.replace(optima, searched=searched)
-    observation = jax.tree.map(lambda x: jnp.asarray(x[searched.at]), searched.found.seen)
-    error = np.concatenate([np.asarray(posed.whitened(observation)), z - np.asarray(posed.data.centre)])
-    rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
-    jacobian = jnp.asarray(np.concatenate([searched.slope, rows, np.eye(len(z))]))
-    best = optimizers.optimum_at(jacobian, jnp.asarray(error), jnp.asarray(z), posed.data, jnp.asarray(0), jacobian)
-    settled = np.array([searched.found.settled])
-    best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
-    start_outcomes = StartOutcomes(
-        np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations)
+    observation = jax.tree.map(lambda x: jnp.asarray(x[searched.best]), searched.population.observations)
+    residual = np.concatenate([np.asarray(problem.whitened(observation)), z - np.asarray(problem.data.centre)])
+    penalty_rows = np.zeros((problem.data.measured.shape[0], len(z)))  # of the penalty on adhesion
+    jacobian = jnp.asarray(np.concatenate([searched.slope, penalty_rows, np.eye(len(z))]))
+    best = optimizers.optimum_at(
+        jacobian, jnp.asarray(residual), jnp.asarray(z), problem.data, jnp.asarray(0), jacobian
     )
-    return MultistartResult(posed, best, start_outcomes, shares, searched)
+    has_settled = np.array([searched.population.settled])
+    best = dataclasses.replace(best, converged=jnp.asarray(searched.population.settled))
+    start_outcomes = StartOutcomes(
+        np.array([float(best.cost)]), has_settled, sum(g.failed for g in searched.population.generations)
+    )
+    return MultistartResult(problem, best, start_outcomes, shares, searched)
 
 
 def initial_noise_shares(noise: Noise) -> np.ndarray:
@@ -236,16 +240,16 @@ def initial_noise_shares(noise: Noise) -> np.ndarray:
     return np.where(noise.estimated, noise_room.START, np.nan)
 
 
-def _pick_member(found: T, k: int) -> T:
-    return jax.tree.map(lambda x: x[k], found)
+def _pick_member(members: T, k: int) -> T:
+    return jax.tree.map(lambda x: x[k], members)
 
 
-def _outcome_of_searches(found: optimizers.Optimum, feasible: np.ndarray) -> StartOutcomes:
-    cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
-    return StartOutcomes(cost, np.asarray(found.converged), int(np.sum(~feasible)), np.asarray(found.z))
+def _outcome_of_searches(optima: optimizers.Optimum, feasible: np.ndarray) -> StartOutcomes:
+    cost = np.where(np.isfinite(optima.cost), optima.cost, np.inf)
+    return StartOutcomes(cost, np.asarray(optima.converged), int(np.sum(~feasible)), np.asarray(optima.z))
 
 
-def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
+def _reestimate_shares(problem: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
     """Noise of each channel relative to its size, estimated from the misfit at z and corrected for degrees of
     freedom, NaN if known. None if all noise is known, or if the estimate has settled.
 
@@ -254,26 +258,26 @@ def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.n
     """
     if not noise.estimated.any():
         return None
-    data = posed.data
+    data = problem.data
     size = noise.sd / noise_room.START  # the reference of an estimated share
     weight = np.asarray(data.weight)
-    error = np.asarray(optimizers.observe_at(posed, jnp.asarray(z)).reading - data.measured) / size
+    error = np.asarray(optimizers.observe_at(problem, jnp.asarray(z)).reading - data.measured) / size
     error = np.where(weight > 0, error, 0.0)
-    leverage = identifiability.analyse_identifiability(posed, jnp.asarray(z)).leverage
+    leverage = identifiability.analyse_identifiability(problem, jnp.asarray(z)).leverage
     freedom = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
-    new = np.maximum(np.sqrt(np.sum(error**2, 0) / freedom), series_noise.FLOOR)
-    new = np.where(noise.estimated, new, np.nan)
-    return None if np.nanmax(np.abs(new / shares - 1)) < SETTLED_SHARE else new
+    new_shares = np.maximum(np.sqrt(np.sum(error**2, 0) / freedom), series_noise.FLOOR)
+    new_shares = np.where(noise.estimated, new_shares, np.nan)
+    return None if np.nanmax(np.abs(new_shares / shares - 1)) < SETTLED_SHARE else new_shares
 
 
-def with_noise_shares(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
+def with_noise_shares(problem: Problem, noise: Noise, shares: np.ndarray) -> Problem:
     """Problem with estimated noise, relative to the readings, shape (channels,)."""
     sd = np.where(noise.estimated, noise.sd / noise_room.START * shares, noise.sd)
-    return posed.with_data(sd=jnp.asarray(sd))
+    return problem.with_data(sd=jnp.asarray(sd))
 
 
 def _search_until_feasible(
-    posed: Problem, points: np.ndarray, search: Callable[..., Any]
+    problem: Problem, points: np.ndarray, search: Callable[..., Any]
 ) -> tuple[Problem, optimizers.Optimum, np.ndarray]:
     """Searches from all points. The penalty on adhesion becomes stiffer until no row slides at the best point.
 
@@ -281,9 +285,9 @@ def _search_until_feasible(
         The problem, the searches, and True for each feasible start.
     """
     for _ in range(TIGHTENINGS + 1):
-        optima, status_start, status_end = search(posed, jnp.asarray(points))
+        optima, status_start, status_end = search(problem, jnp.asarray(points))
         k = int(np.nanargmin(optima.cost))
-        if not posed.unreachable_rows(status_end)[k].any():
+        if not problem.unreachable_rows(status_end)[k].any():
             break
-        posed = posed.with_data(stiffness=posed.data.stiffness / 10)
-    return posed, optima, ~np.any(posed.unreachable_rows(status_start), axis=1)
+        problem = problem.with_data(stiffness=problem.data.stiffness / 10)
+    return problem, optima, ~np.any(problem.unreachable_rows(status_start), axis=1)

@@ -75,12 +75,12 @@ class Noise:
         return dataclasses.replace(self, sd=self.sd * factor)
 
 
-def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]]:
+def parse_noise(text: str, measured_channels: tuple[Channel, ...]) -> dict[int, tuple[float, bool]]:
     """Reads noise given as text, such as `current=2%,motor_speed=0.5%,speed=1%` or
     `current=0.05A,motor_speed=30rpm,speed=5mm/s`.
 
     Args:
-        shown: the available channels.
+        measured_channels: the available channels.
 
     Returns:
         Position of the channel → (number, True for a share of the reading). Absolute numbers in SI.
@@ -88,28 +88,30 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
     Raises:
         BadConfiguration: an unknown channel, a number that is not positive, or another unit.
     """
-    words = {c.word: k for k, c in enumerate(shown)}
-    channel_of_word = words | {c.name: k for k, c in enumerate(shown)}
-    channel_sizes: dict[int, tuple[float, bool]] = {}
+    channel_of_short_name = {c.word: k for k, c in enumerate(measured_channels)}
+    channel_of_word = channel_of_short_name | {c.name: k for k, c in enumerate(measured_channels)}
+    noise_of_channel: dict[int, tuple[float, bool]] = {}
     for part in text.split(","):
         name, _, value = part.strip().partition("=")
         if name not in channel_of_word:
-            raise BadConfiguration(f"--noise {part.strip()}: no such channel; {allowed_words(name, words)}")
+            raise BadConfiguration(
+                f"--noise {part.strip()}: no such channel; {allowed_words(name, channel_of_short_name)}"
+            )
         k = channel_of_word[name]
-        if k in channel_sizes:
+        if k in noise_of_channel:
             raise BadConfiguration(f"--noise {part.strip()}: {name} is given twice; expected each channel once")
-        channel = shown[k]
+        channel = measured_channels[k]
         match = re.fullmatch(r"\s*(\+?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(%|[^\d\s.]+)\s*", value)
-        sizes = channel.sizes
-        form = (
-            f"expected a positive number with % or {' or '.join(sizes)}, e.g. {name}=2% or {name}=0.1{channel.unit}"
+        units = channel.sizes
+        expected = (
+            f"expected a positive number with % or {' or '.join(units)}, e.g. {name}=2% or {name}=0.1{channel.unit}"
         )
         size = float(match[1]) if match else math.nan
-        if match is None or not 0 < size < math.inf or match[2] not in ("%", *sizes):
-            raise BadConfiguration(f"--noise {part.strip()}: {form}")
+        if match is None or not 0 < size < math.inf or match[2] not in ("%", *units):
+            raise BadConfiguration(f"--noise {part.strip()}: {expected}")
         relative = match[2] == "%"
-        channel_sizes[k] = (size / 100 if relative else size * sizes[match[2]], relative)
-    return channel_sizes
+        noise_of_channel[k] = (size / 100 if relative else size * units[match[2]], relative)
+    return noise_of_channel
 
 
 def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
@@ -127,41 +129,43 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
         BadData: a channel reads zero everywhere and has no stated sd.
     """
     shares = parse_noise(stated, runs.channels) if stated else {}
-    measured, columns = runs.measured(), runs.deviations()
+    measured = runs.measured()
+    sd_columns = runs.deviations()
     rms = np.sqrt(np.nanmean(np.where(np.isfinite(measured).any(0), measured, 0.0) ** 2, 0))
     sizes = np.maximum(sizes, LEAST_SIZE * rms)
-    sd, source = np.ones_like(measured), []
+    sd = np.ones_like(measured)
+    source = []
     for k, channel in enumerate(runs.channels):
         finite = np.isfinite(measured[:, k])
         if not finite.any():
             source.append("no readings")
             continue
         if k not in shares and runs.has(channel.sd_column):
-            sd[:, k] = np.where(finite, columns[:, k], 1.0)
+            sd[:, k] = np.where(finite, sd_columns[:, k], 1.0)
             source.append("columns")
             continue
-        size, relative = shares.get(k, (START, True))
-        if relative and not np.any(measured[finite, k] != 0):
+        sd_or_share, is_share = shares.get(k, (START, True))
+        if is_share and not np.any(measured[finite, k] != 0):
             raise BadData(
                 f"{runs.source}: {channel.name} reads 0 in every "
                 f"row{', so nothing moves' * channel.zero_at_rest}; log it while it changes, or give its noise "
                 f"in {channel.unit} with --noise"
             )
-        sd[:, k] = np.where(finite, size * sizes[:, k] if relative else size, 1.0)
+        sd[:, k] = np.where(finite, sd_or_share * sizes[:, k] if is_share else sd_or_share, 1.0)
         source.append("stated" if k in shares else "estimated")
     quantum = np.array([runs.layout.variance(name) for name in channels.channel_names(runs.channels)])
-    includes_estimate = np.array([s in ("columns", "stated") for s in source])  # an estimate already includes it
-    if (includes_estimate & (quantum > 0)).any():
-        sd = np.where(includes_estimate & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
+    is_stated = np.array([s in ("columns", "stated") for s in source])  # an estimate already includes it
+    if (is_stated & (quantum > 0)).any():
+        sd = np.where(is_stated & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
     return Noise(runs.channels, sd, np.array([s == "estimated" for s in source]), tuple(source))
 
 
-def default_noise(shown: Iterable[Channel]) -> str:
+def default_noise(measured_channels: Iterable[Channel]) -> str:
     """Default noise of the loop, used if neither the file nor the user states any.
 
     They are for averages of at least three repeats, printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2.
     """
-    return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in shown)
+    return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in measured_channels)
 
 
 def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
@@ -176,18 +180,20 @@ def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noi
     table_noise = noise_from_table(runs, sizes, stated)
     if not table_noise.estimated.any():
         return table_noise
-    sd, words, series = table_noise.sd.copy(), list(table_noise.source), []
-    guess = noise_from_table(runs, sizes, default_noise(runs.channels))
+    sd = table_noise.sd.copy()
+    sources = list(table_noise.source)
+    series = []
+    assumed = noise_from_table(runs, sizes, default_noise(runs.channels))
     from_series = series_noise.estimate_noise(runs, sizes)
     for k in np.flatnonzero(table_noise.estimated):
         estimate = from_series[k]
         if estimate is None:
-            sd[:, k], words[k] = guess.sd[:, k], "assumed"
+            sd[:, k], sources[k] = assumed.sd[:, k], "assumed"
         else:
             sd[:, k] = np.where(np.isfinite(runs.measured()[:, k]), estimate.sd(sizes[:, k]), 1.0)
-            words[k] = "series"
+            sources[k] = "series"
             series.append(estimate)
-    return Noise(runs.channels, sd, np.zeros(len(words), bool), tuple(words), tuple(series))
+    return Noise(runs.channels, sd, np.zeros(len(sources), bool), tuple(sources), tuple(series))
 
 
 # --- repeats --------------------------------------------------------------------------------------------
@@ -215,7 +221,8 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
     difference_in_sds = np.abs(runs.measured()[first_rows] - runs.measured()[second_rows]) / np.hypot(
         noise.sd[first_rows], noise.sd[second_rows]
     )
-    factors, notes = dict[str, float](), list[Remark]()
+    factors = dict[str, float]()
+    remarks = list[Remark]()
     for k, channel in enumerate(noise.channels):
         deviations = difference_in_sds[np.isfinite(difference_in_sds[:, k]), k]
         if len(deviations) < REPEATS or noise.source[k] in ("series", "estimated", "no readings"):
@@ -223,7 +230,7 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
         median = float(np.median(deviations))
         if _median_tail(median, len(deviations)) < IMPROBABLE:
             factors[channel.name] = median / MEDIAN
-            notes.append(
+            remarks.append(
                 Remark(
                     "larger_noise",
                     channel=channel.name,
@@ -232,12 +239,13 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
                     source=UNSTATED.get(noise.source[k], "stated"),
                 )
             )
-    return noise.scaled(factors), notes
+    return noise.scaled(factors), remarks
 
 
 def _median_tail(median: float, count: int) -> float:
     """Probability that the median magnitude of `count` standard normal numbers is at least `median`."""
-    tail_probability, needed_count = math.erfc(median / math.sqrt(2)), (count + 1) // 2
+    tail_probability = math.erfc(median / math.sqrt(2))
+    needed_count = (count + 1) // 2
     return sum(
         math.comb(count, k) * tail_probability**k * (1 - tail_probability) ** (count - k)
         for k in range(needed_count, count + 1)

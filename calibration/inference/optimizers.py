@@ -38,7 +38,7 @@ TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
 #: Multiple of the decrease predicted by its linearisation that a search of rollouts may still achieve.
 HOPELESS = 10.0
 #: Number of last steps that predict the further decrease of a search of rollouts. Share of the objective by which
-#: twice as many have to lower it. (Where a load sticks, a rollout is not smooth, and its Jacobian promises more.)
+#: twice as many have to lower it. Where a load sticks, a rollout is not smooth, and its Jacobian promises more.
 #: A run that breaks away from rest slowly makes the objective rough at 0.002 prior sds, although its Jacobian agrees
 #: with finite differences to 1e-6. So each fit of the drivetrain's log takes 15 to 30 steps. 3 and 3e-4 saved 15 % of
 #: the time and left the objectives higher by up to 1 %; half of the rows saved half of the time.
@@ -79,7 +79,7 @@ class Optimum(eqx.Module):
 
 
 def adhesion_penalty_slice(data: Data) -> slice:
-    """Slice of the adhesion penalties among the residuals: one for each row, between readings and priors."""
+    """Slice of the adhesion penalties in the residuals: one for each row, between readings and priors."""
     return slice(data.measured.size, data.measured.size + data.measured.shape[0])
 
 
@@ -99,58 +99,68 @@ def _evaluate_residuals(problem: Problem, z: Z) -> tuple[Array, Array, Observati
     return r, jnp.concatenate([jacobian, jnp.eye(z.size)]), observation
 
 
-def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
-    """Solver for fits to such data. `long`: True for rollouts."""
-    penalties, tolerance = adhesion_penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
+def _least_squares_solver(data: Data, is_rollout: bool) -> OneSidedLevenbergMarquardt:
+    """Solver for fits to such data. `is_rollout`: True for rollouts."""
+    penalties = adhesion_penalty_slice(data)
+    tolerance = TOLERANCE_LONG if is_rollout else TOLERANCE
     return OneSidedLevenbergMarquardt(
-        tolerance, penalties.start, penalties.stop, near=0.0 if long else NEAR, rough=long
+        tolerance, penalties.start, penalties.stop, near=0.0 if is_rollout else NEAR, rough=is_rollout
     )
 
 
 def optimum_at(jacobian: Array, r: Array, z: Array, data: Data, steps: Array, slope: Array) -> Optimum:
     """Optimum record of a point. `slope` is the Jacobian that predicts its decrement."""
     penalties = adhesion_penalty_slice(data)
-    informed = jacobian[informative_residuals(data)]
-    half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
+    informative_jacobian = jacobian[informative_residuals(data)]
+    inverse_factor = solve_lower(informative_jacobian.T @ informative_jacobian, jnp.eye(z.shape[0]))
     cost = half_squares(r, penalties)
     decrement = cost - half_squares(r + slope @ one_sided_step(r, slope, penalties, 0.0), penalties)
     converged = jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost)
-    return Optimum(z, jnp.linalg.norm(half, axis=0), half.T @ half, cost, decrement, converged, steps)
+    return Optimum(
+        z,
+        jnp.linalg.norm(inverse_factor, axis=0),
+        inverse_factor.T @ inverse_factor,
+        cost,
+        decrement,
+        converged,
+        steps,
+    )
 
 
 def _begin_search(problem: Problem, start: Z) -> SearchState:
     """State of a problem's search before its first evaluation."""
     data = problem.data
-    size, codes = adhesion_penalty_slice(data).stop + start.shape[0], jnp.zeros(data.measured.shape[0], int)
-    aux = jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
+    size = adhesion_penalty_slice(data).stop + start.shape[0]
+    no_codes = jnp.zeros(data.measured.shape[0], int)
+    aux = jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], no_codes, no_codes))
     return _least_squares_solver(data, problem.observe.long).begin(start, size, aux)
 
 
-def _advance_search(problem: Problem, at: SearchState, max_steps: int | Numbers) -> SearchState:
+def _advance_search(problem: Problem, state: SearchState, max_steps: int | Numbers) -> SearchState:
     """One step of a problem's search.
 
     The compiled program evaluates the model in one place, at the start of a step. The point that is accepted there is
     the result of the search, with its residuals, Jacobian and observation.
     """
     solver = _least_squares_solver(problem.data, problem.observe.long)
-    state = solver.step(at, *_evaluate_residuals(problem, at.ahead))
-    is_over = state.over | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(state.y))
-    return dataclasses.replace(state, over=is_over)
+    next_state = solver.step(state, *_evaluate_residuals(problem, state.ahead))
+    is_over = next_state.over | (next_state.steps >= max_steps) | ~jnp.all(jnp.isfinite(next_state.y))
+    return dataclasses.replace(next_state, over=is_over)
 
 
-def _optimum_of_state(at: SearchState, data: Data) -> Optimum:
-    r = jnp.where(jnp.all(jnp.isfinite(at.y)), at.residual, jnp.nan)
-    return optimum_at(at.jacobian, r, at.y, data, at.steps, at.slope)
+def _optimum_of_state(state: SearchState, data: Data) -> Optimum:
+    r = jnp.where(jnp.all(jnp.isfinite(state.y)), state.residual, jnp.nan)
+    return optimum_at(state.jacobian, r, state.y, data, state.steps, state.slope)
 
 
 def levenberg_marquardt(problem: Problem, start: Z, max_steps: int = 100) -> tuple[Optimum, Observation]:
     """Optimum of one search, and the observation there. It can be vmapped over problems and starts."""
 
-    def advance(at: SearchState) -> SearchState:
-        return _advance_search(problem, at, max_steps)
+    def advance(state: SearchState) -> SearchState:
+        return _advance_search(problem, state, max_steps)
 
-    at = jax.lax.while_loop(lambda at: ~at.over, advance, _begin_search(problem, start))
-    return _optimum_of_state(at, problem.data), at.aux
+    state = jax.lax.while_loop(lambda state: ~state.over, advance, _begin_search(problem, start))
+    return _optimum_of_state(state, problem.data), state.aux
 
 
 class HeldCoordinates(eqx.Module):
@@ -201,49 +211,55 @@ class SearchMember(eqx.Module):
 @functools.partial(compiled, options=SELDOM)
 def _placeholder_searches(problem: Problem, members: SearchMember) -> SearchState:
     """States of searches that have already ended, as placeholders."""
-    at = jax.vmap(lambda member: _begin_search(member.problem(problem), member.start))(members)
-    return dataclasses.replace(at, over=jnp.ones_like(at.over))
+    states = jax.vmap(lambda member: _begin_search(member.problem(problem), member.start))(members)
+    return dataclasses.replace(states, over=jnp.ones_like(states.over))
 
 
-def _start_fresh_searches(problem: Problem, members: SearchMember, fresh: Numbers, at: SearchState) -> SearchState:
+def _start_fresh_searches(
+    problem: Problem, members: SearchMember, fresh: Numbers, states: SearchState
+) -> SearchState:
     """States of parallel searches after the `fresh` ones were reset to their starts."""
 
-    def begin(member: SearchMember, fresh: Array, at: SearchState) -> SearchState:
-        search_begin = _begin_search(member.problem(problem), member.start)
-        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), search_begin, at)
+    def begin(member: SearchMember, fresh: Array, state: SearchState) -> SearchState:
+        begun = _begin_search(member.problem(problem), member.start)
+        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, state)
 
-    return jax.vmap(begin)(members, fresh, at)
+    return jax.vmap(begin)(members, fresh, states)
 
 
-_admitted = compiled(_start_fresh_searches, options=SELDOM)
+_start_fresh_compiled = compiled(_start_fresh_searches, options=SELDOM)
 
 
 def _step_unfinished(
-    problem: Problem, members: SearchMember, at: SearchState, roots: tuple[Array, Array] | None, max_steps: Numbers
+    problem: Problem,
+    members: SearchMember,
+    states: SearchState,
+    roots: tuple[Array, Array] | None,
+    max_steps: Numbers,
 ) -> SearchState:
     """One step of each unfinished search. `roots`: solved rows of each, if a separate program solves them."""
 
-    def advance(member: SearchMember, at: SearchState, roots: tuple[Array, Array] | None) -> SearchState:
-        new = _advance_search(dataclasses.replace(member.problem(problem), roots=roots), at, max_steps)
-        return jax.tree.map(lambda new, old: jnp.where(at.over, old, new), new, at)
+    def advance(member: SearchMember, state: SearchState, roots: tuple[Array, Array] | None) -> SearchState:
+        new = _advance_search(dataclasses.replace(member.problem(problem), roots=roots), state, max_steps)
+        return jax.tree.map(lambda new, old: jnp.where(state.over, old, new), new, state)
 
-    return jax.vmap(advance)(members, at, roots)
+    return jax.vmap(advance)(members, states, roots)
 
 
-def _optima_of_states(problem: Problem, members: SearchMember, at: SearchState) -> Optimum:
-    return jax.vmap(lambda member, at: _optimum_of_state(at, member.problem(problem).data))(members, at)
+def _optima_of_states(problem: Problem, members: SearchMember, states: SearchState) -> Optimum:
+    return jax.vmap(lambda member, states: _optimum_of_state(states, member.problem(problem).data))(members, states)
 
 
 def _continue_searches(
-    problem: Problem, members: SearchMember, fresh: Numbers, at: SearchState, enough: Numbers, max_steps: Numbers
+    problem: Problem, members: SearchMember, fresh: Numbers, states: SearchState, enough: Numbers, max_steps: Numbers
 ) -> tuple[SearchState, Optimum]:
     """Continues parallel searches until `enough` of them have ended. `fresh` ones begin at their starts."""
-    at = jax.lax.while_loop(
-        lambda at: jnp.sum(at.over) < enough,
-        lambda at: _step_unfinished(problem, members, at, None, max_steps),
-        _start_fresh_searches(problem, members, fresh, at),
+    states = jax.lax.while_loop(
+        lambda states: jnp.sum(states.over) < enough,
+        lambda states: _step_unfinished(problem, members, states, None, max_steps),
+        _start_fresh_searches(problem, members, fresh, states),
     )
-    return at, _optima_of_states(problem, members, at)
+    return states, _optima_of_states(problem, members, states)
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -255,33 +271,33 @@ def _solve_rows(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[A
         return problem.observe.solve(coordinates.robot(problem.base, z))
 
     solutions = jax.vmap(solve_member)(z, active)
-    assert solutions is not None  # of an observer that is `apart`
+    assert solutions is not None  # of an observer with `solves_separately`
     return solutions
 
 
 @functools.partial(compiled, options=OVER_TIME)
 def _step_with_roots(
-    problem: Problem, members: SearchMember, at: SearchState, roots: tuple[Array, Array], max_steps: Numbers
+    problem: Problem, members: SearchMember, states: SearchState, roots: tuple[Array, Array], max_steps: Numbers
 ) -> tuple[SearchState, Optimum]:
-    at = _step_unfinished(problem, members, at, roots, max_steps)
-    return at, _optima_of_states(problem, members, at)
+    states = _step_unfinished(problem, members, states, roots, max_steps)
+    return states, _optima_of_states(problem, members, states)
 
 
 def _continue_searches_separately(
-    problem: Problem, members: SearchMember, fresh: Numbers, at: SearchState, enough: Numbers, max_steps: Numbers
+    problem: Problem, members: SearchMember, fresh: Numbers, states: SearchState, enough: Numbers, max_steps: Numbers
 ) -> tuple[SearchState, Optimum]:
-    """`_continue_searches` for observers whose rows are solved by a separate program (`Observer.apart`)."""
-    at = _admitted(problem, members, fresh, at)
+    """`_continue_searches` for observers that solve rows by a separate program (`Observer.solves_separately`)."""
+    states = _start_fresh_compiled(problem, members, fresh, states)
     while True:
-        roots = _solve_rows(problem, at.ahead, members.active)
-        at, results = _step_with_roots(problem, members, at, roots, max_steps)
-        if np.asarray(at.over).sum() >= enough:
-            return at, results
+        roots = _solve_rows(problem, states.ahead, members.active)
+        states, results = _step_with_roots(problem, members, states, roots, max_steps)
+        if np.asarray(states.over).sum() >= enough:
+            return states, results
 
 
 def with_solved_rows(problem: Problem, z: Z) -> Problem:
     """Problem with its rows solved at z. Unchanged if its observer needs no separate program."""
-    if not problem.observe.apart:
+    if not problem.observe.solves_separately:
         return problem
     return dataclasses.replace(
         problem, roots=jax.tree.map(lambda x: x[0], solve_rows_at(problem, np.asarray(z)[None]))
@@ -290,15 +306,16 @@ def with_solved_rows(problem: Problem, z: Z) -> Problem:
 
 def solve_rows_at(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
     """Solutions of the rows at several z (first axis), by the program of the searches."""
-    count, active = problem.observe.searches_per_core(problem), getattr(problem.coordinates, "active", None)
+    count = problem.observe.searches_per_core(problem)
+    active = getattr(problem.coordinates, "active", None)
     slots = None if active is None else np.repeat(np.asarray(active)[None], count, 0)
-    filled = np.resize(zs, (-(-len(zs) // count) * count, zs.shape[1]))
-    parts = [jax.device_get(_solve_rows(problem, part, slots)) for part in filled.reshape(-1, count, zs.shape[1])]
+    padded = np.resize(zs, (-(-len(zs) // count) * count, zs.shape[1]))
+    parts = [jax.device_get(_solve_rows(problem, part, slots)) for part in padded.reshape(-1, count, zs.shape[1])]
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(zs)], *parts)
 
 
-_go_on_often = compiled(_continue_searches, options=SMALL)
-_go_on_seldom = compiled(_continue_searches, options=SELDOM)
+_continue_frequent = compiled(_continue_searches, options=SMALL)
+_continue_rare = compiled(_continue_searches, options=SELDOM)
 
 
 class SearchQueue:
@@ -334,10 +351,10 @@ class SearchQueue:
         self.holds[fresh] = [self.waiting.pop() for _ in fresh]
         return fresh
 
-    def leave(self, over: np.ndarray, found: Any) -> None:
-        """Removes members whose search has ended, and keeps their results. The first axis of `found` is the place."""
-        for place in np.flatnonzero(over & self.taken):
-            self.ended[int(self.holds[place])] = jax.tree.map(lambda x: x[place], found)  # noqa: B023
+    def leave(self, is_over: np.ndarray, results: Any) -> None:
+        """Removes members whose search has ended, and keeps their results, whose first axis is the place."""
+        for place in np.flatnonzero(is_over & self.taken):
+            self.ended[int(self.holds[place])] = jax.tree.map(lambda x: x[place], results)  # noqa: B023
             self.holds[place] = -1
 
 
@@ -364,26 +381,30 @@ def _search_with_states(
     problem: Problem, members: SearchMember, max_steps: int, places: int
 ) -> tuple[Optimum, SearchState]:
     """Results of `search_refilling`, with the state of the solver at the end of each search."""
-    count, step_limit = len(members.start), np.asarray(max_steps)
+    count = len(members.start)
+    step_limit = np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
     first_members = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
-    idle = _placeholder_searches(problem, first_members)
-    go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
-    go_on = _continue_searches_separately if problem.observe.apart else go_on
+    placeholders = _placeholder_searches(problem, first_members)
+    continue_searches = _continue_rare if getattr(problem.coordinates, "fitted_once", False) else _continue_frequent
+    continue_searches = _continue_searches_separately if problem.observe.solves_separately else continue_searches
 
     def search_on_core(core: int) -> dict[int, Any]:
-        assigned, states = SearchQueue(range(core, count, cores), places), idle
-        while assigned:
-            fresh = np.isin(np.arange(places), assigned.fill())
-            own_members = jax.tree.map(lambda x: x[assigned.member], members)
-            running = int(assigned.taken.sum())
-            enough = places - running + (max(1, places // 4) if assigned.waiting else running)
-            states, results = go_on(problem, own_members, fresh, states, np.asarray(enough), step_limit)
-            assigned.leave(*jax.device_get((states.over, (results, states))))
-        return assigned.ended
+        queue = SearchQueue(range(core, count, cores), places)
+        states = placeholders
+        while queue:
+            is_fresh = np.isin(np.arange(places), queue.fill())
+            members_in_places = jax.tree.map(lambda x: x[queue.member], members)
+            running = int(queue.taken.sum())
+            enough = places - running + (max(1, places // 4) if queue.waiting else running)
+            states, results = continue_searches(
+                problem, members_in_places, is_fresh, states, np.asarray(enough), step_limit
+            )
+            queue.leave(*jax.device_get((states.over, (results, states))))
+        return queue.ended
 
     if cores > 1:  # compiles the program once, by a call that takes no step
-        go_on(problem, first_members, np.zeros(places, bool), idle, np.asarray(0), step_limit)
+        continue_searches(problem, first_members, np.zeros(places, bool), placeholders, np.asarray(0), step_limit)
     with Threads(cores) as pool:
         results_by_member = {
             k: result for part in pool.map(search_on_core, range(cores)) for k, result in part.items()
@@ -398,8 +419,8 @@ def linearise(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
         r, jacobian, observation = linearise_rollout(problem, z)
     else:
         active = getattr(problem.coordinates, "active", None)
-        member = SearchMember(z, data.weight, data.measured, data.centre, active)
-        members = jax.tree.map(lambda x: np.asarray(x)[None], member)
+        search = SearchMember(z, data.weight, data.measured, data.centre, active)
+        members = jax.tree.map(lambda x: np.asarray(x)[None], search)
         _, final_states = _search_with_states(problem, members, 1, problem.observe.searches_per_core(problem))
         state = jax.tree.map(lambda x: jnp.asarray(x[0]), final_states)
         r, jacobian, observation = state.residual, state.jacobian, state.aux
@@ -454,24 +475,25 @@ def search_rollout(
     Returns:
         The optimum, and the observations at the start and at the end.
     """
-    state, first = _begin_search(problem, start), None
+    state = _begin_search(problem, start)
+    observation_at_start = None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
         # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
         r = evaluate_residuals(problem, state.ahead) if state.rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
             r, jacobian, observation = linearise_rollout(problem, state.ahead)
-        first = observation if first is None else first
-        state, end = _step_search(state, (r, jacobian, observation), problem.data)
+        observation_at_start = observation if observation_at_start is None else observation_at_start
+        state, point = _step_search(state, (r, jacobian, observation), problem.data)
         done = bool(state.over)
         if best is None or state.rejected == 0:  # the first step only evaluates the start
-            best = end
-            done |= bool(end.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * end.cost))
+            best = point
+            done |= bool(point.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * point.cost))
         tell(steps, float(best.cost))
         if done:
             break
-    assert best is not None and first is not None
-    return best, first, state.aux
+    assert best is not None and observation_at_start is not None
+    return best, observation_at_start, state.aux
 
 
 #: Function of members' coordinates and indices: residuals, penalties with their signs, their Jacobian and the
@@ -480,9 +502,9 @@ Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Obse
 
 
 @functools.partial(compiled, options=SELDOM)
-def _step_search(at: SearchState, evaluation: tuple[Array, Array, Any], data: Data) -> tuple[SearchState, Optimum]:
+def _step_search(state: SearchState, evaluation: tuple[Array, Array, Any], data: Data) -> tuple[SearchState, Optimum]:
     """Next step of a search, and its best point."""
-    new = _least_squares_solver(data, long=True).step(at, *evaluation)
+    new = _least_squares_solver(data, is_rollout=True).step(state, *evaluation)
     return new, _optimum_of_state(new, data)
 
 
@@ -515,39 +537,43 @@ def search_rollouts(
     Returns:
         The end of each search, and the observation there.
     """
-    starts, weights, solver = np.asarray(starts), np.asarray(weights), _least_squares_solver(data, long=True)
-    assigned = SearchQueue(range(len(starts)), len(starts) if within <= SAME else min(places, len(starts)))
-    cost, ahead = np.full(len(starts), np.inf), starts[assigned.member]
-    trail = np.full((2 * LATELY, len(assigned.member)), np.nan)
+    starts = np.asarray(starts)
+    weights = np.asarray(weights)
+    solver = _least_squares_solver(data, is_rollout=True)
+    queue = SearchQueue(range(len(starts)), len(starts) if within <= SAME else min(places, len(starts)))
+    cost = np.full(len(starts), np.inf)
+    ahead = starts[queue.member]
+    cost_history = np.full((2 * LATELY, len(queue.member)), np.nan)
     searches: list[Any] = [None] * len(ahead)
-    while assigned:
-        fresh, going = assigned.fill(), np.flatnonzero(assigned.taken)
+    while queue:
+        fresh = queue.fill()
+        active_places = np.flatnonzero(queue.taken)
         # A step accepts or rejects the point to which the last one led; an accepted point becomes y.
-        ahead[fresh], trail[:, fresh] = starts[assigned.holds[fresh]], np.nan
-        evaluated = evaluate(ahead[going], assigned.holds[going])
-        for j, k in enumerate(going):  # one at a time, so that one program serves any number of searches
+        ahead[fresh], cost_history[:, fresh] = starts[queue.holds[fresh]], np.nan
+        evaluated = evaluate(ahead[active_places], queue.holds[active_places])
+        for j, k in enumerate(active_places):  # one at a time, so that one program serves any number of searches
             evaluation = jax.tree.map(lambda x: x[j], evaluated)  # noqa: B023
             if k in fresh:
                 searches[k] = jax.device_get(solver.begin(ahead[k], evaluation[0].size, evaluation[2])), None
             searches[k] = jax.device_get(_step_search(searches[k][0], evaluation, data))
-        results = [(s.over, s.steps, s.ahead, s.aux, end) for s, end in searches]
-        finished, steps, ahead, observation, ends = jax.tree.map(lambda *x: np.stack(x), *results)
-        small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
-        is_over = finished | (steps >= max_steps) | (ends.decrement < small)
-        is_over = is_over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
-        cost[assigned.holds[going]] = ends.cost[going]
+        results = [(state.over, state.steps, state.ahead, state.aux, point) for state, point in searches]
+        is_finished, steps, ahead, observation, points = jax.tree.map(lambda *x: np.stack(x), *results)
+        negligible_decrease = 0.1 * (DECREMENT + DECREMENT_SHARE * points.cost)
+        is_over = is_finished | (steps >= max_steps) | (points.decrement < negligible_decrease)
+        is_over = is_over | (cost_history[0] - points.cost < SAME + STALLED * points.cost)
+        cost[queue.holds[active_places]] = points.cost[active_places]
         if within < np.inf:
-            done = np.r_[[*assigned.ended], assigned.holds[is_over & assigned.taken]].astype(int)
-            lowest = np.min(cost[done], initial=np.inf)
-            lower = assigned.taken & ~is_over & (ends.cost < lowest - SAME)
-            agree = within <= SAME and np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
-            so_far = min(lowest, np.min(ends.cost[assigned.taken]))
+            finished_members = np.r_[[*queue.ended], queue.holds[is_over & queue.taken]].astype(int)
+            lowest = np.min(cost[finished_members], initial=np.inf)
+            is_lower = queue.taken & ~is_over & (points.cost < lowest - SAME)
+            agree = within <= SAME and np.sum(cost[finished_members] < lowest + SAME) >= AGREE and not is_lower.any()
+            lowest_so_far = min(lowest, np.min(points.cost[queue.taken]))
             with np.errstate(invalid="ignore"):  # NaN of runs that cannot be simulated yet
-                hope = HOPELESS * np.fmin(ends.decrement, trail[LATELY] - ends.cost)
-            is_over = is_over | (ends.cost - hope > so_far + within) | agree
-        trail = np.concatenate([trail[1:], ends.cost[None]])
-        assigned.leave(is_over, (ends, observation))
-    return jax.tree.map(lambda *x: np.stack(x), *(assigned.ended[k] for k in range(len(starts))))
+                possible_decrease = HOPELESS * np.fmin(points.decrement, cost_history[LATELY] - points.cost)
+            is_over = is_over | (points.cost - possible_decrease > lowest_so_far + within) | agree
+        cost_history = np.concatenate([cost_history[1:], points.cost[None]])
+        queue.leave(is_over, (points, observation))
+    return jax.tree.map(lambda *x: np.stack(x), *(queue.ended[k] for k in range(len(starts))))
 
 
 def search_starts(
@@ -561,13 +587,15 @@ def search_starts(
         The end of each search, and the status of each row at its start and at its end.
     """
     data = problem.data
-    if not problem.observe.apart:
+    if not problem.observe.solves_separately:
         size = min(len(starts), max(1, AT_ONCE // len(data.measured)))
-        filled = np.resize(starts, (-(-len(starts) // size) * size, starts.shape[1]))  # one program for all batches
-        parts = [jax.device_get(_search_starts(problem, z)) for z in filled.reshape(-1, size, starts.shape[1])]
+        padded = np.resize(starts, (-(-len(starts) // size) * size, starts.shape[1]))  # one program for all batches
+        parts = [jax.device_get(_search_starts(problem, z)) for z in padded.reshape(-1, size, starts.shape[1])]
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(starts)], *parts)
-    tables = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
-    members = SearchMember(np.asarray(starts), *tables)
+    repeated_data = (
+        np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre)
+    )
+    members = SearchMember(np.asarray(starts), *repeated_data)
     # A search of one step evaluates its start.
     first_results, final_results = (
         search_refilling(problem, members, steps, problem.observe.searches_per_core(problem)) for steps in (1, 100)
@@ -586,7 +614,7 @@ def _search_starts(problem: Problem, starts: Array | np.ndarray) -> tuple[Optimu
 
 def observe_robot(problem: Problem, robot: Robot) -> Observation:
     """Observation of any robot in each row of the problem, by a compiled program."""
-    return problem.observe.read(robot) if problem.observe.apart else _simulated_readings(problem, robot)
+    return problem.observe.read(robot) if problem.observe.solves_separately else _simulated_readings(problem, robot)
 
 
 @functools.partial(compiled, options=OVER_TIME)

@@ -72,13 +72,13 @@ class Population:
 
     Attributes:
         z: coordinates, shape (members, parameters).
-        seen: observation of each member, first axis the members.
+        observations: observation of each member, first axis the members.
         cost: objective with the final noise of the search [½σ²], inf if a member has none.
         generations: summary of each generation.
     """
 
     z: Float[np.ndarray, "members parameters"]
-    seen: Observation
+    observations: Observation
     cost: Float[np.ndarray, " members"]
     generations: tuple[Generation, ...]
 
@@ -95,8 +95,8 @@ class Population:
 
     def outcomes(self) -> dict[str, int]:
         """Number of members with at least one row of each status or flag. Zeros are omitted."""
-        counts = {word: int((self.seen.status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
-        counts["jumps"] = int((self.seen.flags >> FLAGS.index("jumps") & 1).any(1).sum())
+        counts = {word: int((self.observations.status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
+        counts["jumps"] = int((self.observations.flags >> FLAGS.index("jumps") & 1).any(1).sum())
         return {word: count for word, count in counts.items() if count}
 
 
@@ -112,25 +112,25 @@ def compute_without_storing(name: str, make: Callable[[], Any]) -> Any:
 
 
 def simulate_members(
-    posed: Problem,
+    problem: Problem,
     points: np.ndarray,
     advance: Callable[[int], None] = lambda _: None,
-    together: int | None = None,
+    batch_size: int | None = None,
 ) -> Observation:
     """Simulates the rows for each point.
 
     Args:
         advance: callback for the number of simulated members.
-        together: number of members in one batch. None: `TOGETHER`.
+        batch_size: number of members in one batch. None: `TOGETHER`.
     """
-    together = together or TOGETHER[jax.default_backend() != "cpu"]
+    batch_size = batch_size or TOGETHER[jax.default_backend() != "cpu"]
     batches = []
-    for first in range(0, len(points), together):
-        part = points[first : first + together]
-        filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
-        observed = jax.device_get(_observe_points(posed, jnp.asarray(filled)))
-        batches.append(jax.tree.map(lambda x: x[: len(part)], observed))  # noqa: B023
-        advance(first + len(part))
+    for first in range(0, len(points), batch_size):
+        batch = points[first : first + batch_size]
+        padded = np.concatenate([batch, np.repeat(batch[-1:], batch_size - len(batch), 0)])
+        observed = jax.device_get(_observe_points(problem, jnp.asarray(padded)))
+        batches.append(jax.tree.map(lambda x: x[: len(batch)], observed))  # noqa: B023
+        advance(first + len(batch))
     return _join_observations(batches)
 
 
@@ -139,50 +139,51 @@ def _join_observations(parts: list[Observation]) -> Observation:
 
 
 @compiled
-def _observe_points(posed: Problem, points: Float[Array, "points parameters"]) -> Observation:
-    return jax.vmap(posed.observation)(points)
+def _observe_points(problem: Problem, points: Float[Array, "points parameters"]) -> Observation:
+    return jax.vmap(problem.observation)(points)
 
 
 def most_probable_noise(
-    posed: Problem, noise: Noise, reading: Float[np.ndarray, "... rows channels"]
+    problem: Problem, noise: Noise, reading: Float[np.ndarray, "... rows channels"]
 ) -> Float[np.ndarray, "... channels"]:
     """Most probable noise of each channel given these readings, relative to the size of the channel. NaN if it is
     known.
     """
-    weight, size = np.asarray(posed.data.weight), noise.sd / noise_room.START
-    error = np.where(weight > 0, (reading - np.asarray(posed.data.measured)) / size, 0.0)
+    weight = np.asarray(problem.data.weight)
+    size = noise.sd / noise_room.START
+    error = np.where(weight > 0, (reading - np.asarray(problem.data.measured)) / size, 0.0)
     share = np.sqrt(np.sum(weight * error**2, -2) / np.maximum(weight.sum(0), 1.0))
     return np.where(noise.estimated, np.hypot(share, series_noise.FLOOR), np.nan)
 
 
-def member_objective(posed: Problem, noise: Noise) -> Objective:
+def member_objective(problem: Problem, noise: Noise) -> Objective:
     """Function that returns the objective of members: half the sum of squared residuals of readings and priors.
 
     If the sd of a channel is unknown, the most probable one for each member is used: n ln s replaces the squares,
     where s is the relative rms error. A measured row that a member does not reach costs `LOST`. A member with an
     included reading that could not be computed costs inf.
     """
-    data = posed.data
+    data = problem.data
     weight, measured, sd = np.asarray(data.weight), np.asarray(data.measured), np.asarray(data.sd)
 
-    def of(z: np.ndarray, seen: Observation) -> Float[np.ndarray, " members"]:
-        error = np.where(weight > 0, seen.reading - measured, 0.0)
+    def objective(z: np.ndarray, observation: Observation) -> Float[np.ndarray, " members"]:
+        error = np.where(weight > 0, observation.reading - measured, 0.0)
         squares = np.sum((z - np.asarray(data.centre)) ** 2, -1)
-        shares = most_probable_noise(posed, noise, np.asarray(seen.reading))
+        shares = most_probable_noise(problem, noise, np.asarray(observation.reading))
         for k, estimated in enumerate(noise.estimated):
             count = weight[:, k].sum()
             if estimated and count:
                 squares += 2 * count * np.log(shares[..., k])
             else:
                 squares += np.sum(weight[:, k] * (error[..., k] / sd[:, k]) ** 2, -1)
-        cost = 0.5 * squares + LOST * posed.unreachable_rows(seen.status).sum(-1)
+        cost = 0.5 * squares + LOST * problem.unreachable_rows(observation.status).sum(-1)
         return np.where(np.isfinite(cost), cost, np.inf)
 
-    return of
+    return objective
 
 
 def run_evolution(
-    posed: Problem,
+    problem: Problem,
     objective: Objective,
     centre: np.ndarray,
     covariance: np.ndarray,
@@ -190,55 +191,58 @@ def run_evolution(
     size: int,
     seed: int,
     generations: int,
-    beside: np.ndarray,
+    further_points: np.ndarray,
     tell: Callable[[Remark], None],
     keep: StoreStage,
 ) -> Population:
     """Searches by generations: each is drawn around the best members of the generations before.
 
     Args:
-        posed: the problem.
+        problem: the problem.
         objective: objective of members.
         centre, covariance: centre and covariance of the first generation, in coordinates z.
         size: number of members in a generation.
         seed: random seed.
         generations: largest number of generations.
-        beside: further points to simulate with the first generation.
+        further_points: further points to simulate with the first generation.
         tell: callback for progress after every batch.
         keep: storage of the generations, so that a search can resume.
     """
     from cmaes import CMA
 
     start_time = time.perf_counter()
-    search = CMA(np.asarray(centre, float), 1.0, population_size=size, seed=seed, cov=np.array(covariance, float))
-    z, cost, seen, progress = np.empty((0, len(centre))), np.empty(0), list[Observation](), list[Generation]()
+    sampler = CMA(np.asarray(centre, float), 1.0, population_size=size, seed=seed, cov=np.array(covariance, float))
+    z = np.empty((0, len(centre)))
+    cost = np.empty(0)
+    observations = list[Observation]()
+    progress = list[Generation]()
     for number in range(1, generations + 1):
-        sample = np.array([search.ask() for _ in range(size)])
-        points = sample if number > 1 else np.concatenate([beside, sample])
+        sample = np.array([sampler.ask() for _ in range(size)])
+        points = sample if number > 1 else np.concatenate([further_points, sample])
 
         def advance(done: int) -> None:
             minutes = (time.perf_counter() - start_time) / 60
             tell(progress_remark("members", number, done, len(points), minutes))  # noqa: B023
 
-        simulate = functools.partial(simulate_members, posed, points, advance)
+        simulate = functools.partial(simulate_members, problem, points, advance)
         generation: Observation = keep(f"generation {number}", simulate)
         z = np.concatenate([z, points])
-        seen.append(generation)
+        observations.append(generation)
         cost = np.concatenate([cost, objective(points, generation)])
-        own_cost = cost[-size:]
-        finite_cost = np.where(np.isfinite(own_cost), own_cost, MISSING**2)
-        search.tell(list(zip(sample, finite_cost.tolist(), strict=True)))
-        failed = int(np.sum(posed.unreachable_rows(generation.status).any(-1)))
-        progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
-        tell(progress_remark("generation", number, cost.min(), np.median(own_cost), failed))
-        population = Population(z, _join_observations(seen), cost, tuple(progress))
+        sample_cost = cost[-size:]
+        finite_cost = np.where(np.isfinite(sample_cost), sample_cost, MISSING**2)
+        sampler.tell(list(zip(sample, finite_cost.tolist(), strict=True)))
+        failed = int(np.sum(problem.unreachable_rows(generation.status).any(-1)))
+        progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(sample_cost))))
+        tell(progress_remark("generation", number, cost.min(), np.median(sample_cost), failed))
+        population = Population(z, _join_observations(observations), cost, tuple(progress))
         if population.settled:
             break
     return population
 
 
 def local_regression(
-    posed: Problem, found: Population, at: int
+    problem: Problem, population: Population, member: int
 ) -> tuple[Float[np.ndarray, "readings parameters"], float]:
     """Derivative of the whitened readings with respect to z near a member, by least squares over its nearest members.
 
@@ -248,24 +252,26 @@ def local_regression(
     Returns:
         The derivative, shape (rows · channels, parameters), and the rms of the residuals [σ].
     """
-    finite = np.isfinite(found.cost)
-    z, reading = found.z[finite], found.seen.reading[finite]
+    finite = np.isfinite(population.cost)
+    z, reading = population.z[finite], population.observations.reading[finite]
     number = min(len(z), MEMBERS_EACH * (z.shape[1] + 1))
     spread = np.linalg.pinv(np.cov(z.T).reshape(z.shape[1], -1))
-    offsets = z - found.z[at]
-    near = np.argsort(np.einsum("ij,jk,ik->i", offsets, spread, offsets), kind="stable")[:number]
-    scale = np.asarray(posed.data.weight / posed.data.sd)
-    reading_changes = np.where(scale > 0, (reading[near] - found.seen.reading[at]) * scale, 0.0).reshape(number, -1)
-    design = np.column_stack([np.ones(number), offsets[near]])
+    offsets = z - population.z[member]
+    nearest = np.argsort(np.einsum("ij,jk,ik->i", offsets, spread, offsets), kind="stable")[:number]
+    scale = np.asarray(problem.data.weight / problem.data.sd)
+    reading_changes = np.where(
+        scale > 0, (reading[nearest] - population.observations.reading[member]) * scale, 0.0
+    ).reshape(number, -1)
+    design = np.column_stack([np.ones(number), offsets[nearest]])
     # A ridge of one prior sd: parameters that the members do not determine get slope zero.
-    ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(offsets[near]) + 1e-12)])
+    ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(offsets[nearest]) + 1e-12)])
     slope = np.linalg.solve(design.T @ design + ridge, design.T @ reading_changes)
     unexplained = reading_changes - design @ slope
     return slope[1:].T, float(np.sqrt(np.mean(unexplained**2)))
 
 
 def unreliable_derivatives(
-    posed: Problem, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
+    problem: Problem, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
 ) -> Bool[np.ndarray, " parameters"]:
     """True for parameters whose derivatives of a run disagree with finite differences, shape (parameters,).
 
@@ -273,9 +279,9 @@ def unreliable_derivatives(
     exceeds both `APART` of its size and one data sd per posterior sd.
     """
     steps = STEP * np.diag(sd)
-    rows = simulate_members(posed, np.concatenate([z + steps, z - steps]))
-    scale = np.asarray(posed.data.weight / posed.data.sd)
-    ahead, behind = np.split(np.where(scale > 0, rows.reading * scale, 0.0), 2)
+    observation = simulate_members(problem, np.concatenate([z + steps, z - steps]))
+    scale = np.asarray(problem.data.weight / problem.data.sd)
+    ahead, behind = np.split(np.where(scale > 0, observation.reading * scale, 0.0), 2)
     differences = ((ahead - behind) / (2 * STEP)).reshape(len(z), -1)  # per posterior sd
     derivatives = jacobian.T * sd[:, None]
     error_norms = np.linalg.norm(derivatives - differences, axis=1)
@@ -298,33 +304,38 @@ class PopulationSearch:
     """Result of a search by generations.
 
     Attributes:
-        found: all members.
-        at: index of the best member.
-        apart: names of parameters whose derivatives of a run disagree with finite differences.
+        population: all members.
+        best: index of the best member.
+        unreliable: names of parameters whose derivatives of a run disagree with finite differences.
         slope: derivative of the whitened readings by regression over members, if those of a run are unreliable,
             otherwise None.
-        left: rms residual of that regression [σ], NaN without one.
+        regression_rms: rms residual of that regression [σ], NaN without one.
         edge: parameters of the best member at the edge of their range, see `parameters_at_edge`.
     """
 
-    found: Population
-    at: int
-    apart: Names
+    population: Population
+    best: int
+    unreliable: Names
     slope: np.ndarray | None
-    left: float
+    regression_rms: float
     edge: dict[str, Remark] = dataclasses.field(default_factory=dict)
 
     def to_json(self) -> Json:
         """Entries of result.json."""
         return {
-            "members": len(self.found.z),
-            **entries_of(self, "settled=found.settled", "generations=found.generations", "outcomes=found.outcomes"),
+            "members": len(self.population.z),
+            **entries_of(
+                self,
+                "settled=population.settled",
+                "generations=population.generations",
+                "outcomes=population.outcomes",
+            ),
             "at_edge": {name: describe(position) for name, position in self.edge.items()},
-            **entries_of(self, "derivatives_apart=apart", "regression_rms_sd=left"),
+            **entries_of(self, "derivatives_apart=unreliable", "regression_rms_sd=regression_rms"),
         }
 
     def remarks(self) -> list[Remark]:
         """Remarks on the search."""
-        members, generations = len(self.found.z), len(self.found.generations)
-        summary = Remark("generations", members=members, generations=generations, settled=self.found.settled)
+        members, generations = len(self.population.z), len(self.population.generations)
+        summary = Remark("generations", members=members, generations=generations, settled=self.population.settled)
         return [summary, *[Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)]

@@ -56,13 +56,22 @@ def settled_rows(log: Runs, robot: Robot, why: str) -> tuple[Runs, Notes]:
         BadData: they have fewer operating points than the loop needs rows, or as for `settling.settle_log`.
     """
     settled = settling.settle_log(log, robot)
-    source, runs, lasts, points = log.source, len(settled.kept), sum(s.lasts for s in settled.kept), settled.points
-    if points < (needed := observers.SettledRuns.fewest):
-        few = Remark(
-            "few_points", source=source, runs=runs, lasts=lasts, points=points, needed=needed, each=settled.shortest
+    source = log.source
+    runs = len(settled.kept)
+    duration = sum(s.lasts for s in settled.kept)
+    points = settled.points
+    if points < (fewest := observers.SettledRuns.fewest):
+        remark = Remark(
+            "few_points",
+            source=source,
+            runs=runs,
+            lasts=duration,
+            points=points,
+            needed=fewest,
+            each=settled.shortest,
         )
-        raise input_errors.BadData(describe(few))
-    return settled.settled_runs(), (Remark("settled_runs", source=source, why=why, runs=runs, lasts=lasts),)
+        raise input_errors.BadData(describe(remark))
+    return settled.settled_runs(), (Remark("settled_runs", source=source, why=why, runs=runs, lasts=duration),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,11 +84,11 @@ class PreparedInput:
         noise: noise of the readings.
         stated: priors, parameter → (mean, sd) [SI].
         names: names of the free parameters.
-        foreign: remarks on friction inherited from another robot.
-        checked: remarks on the table.
-        begins: remarks on the beginnings of its runs.
-        weighed: remarks on the masses that it states.
-        doubted: remarks on settled runs that replace a log, and on units that may be wrong.
+        inherited_remarks: remarks on friction inherited from another robot.
+        table_remarks: remarks on the table.
+        start_remarks: remarks on the beginnings of its runs.
+        mass_remarks: remarks on the masses that it states.
+        log_remarks: remarks on settled runs that replace a log, and on units that may be wrong.
     """
 
     robot: Robot
@@ -87,11 +96,11 @@ class PreparedInput:
     noise: Noise
     stated: Priors
     names: Names
-    foreign: Notes
-    checked: Notes
-    begins: Notes
-    weighed: Notes
-    doubted: Notes = ()
+    inherited_remarks: Notes
+    table_remarks: Notes
+    start_remarks: Notes
+    mass_remarks: Notes
+    log_remarks: Notes = ()
 
 
 def prepare_input(
@@ -128,23 +137,26 @@ def prepare_input(
     )
     priors = configuration_tables.values_of_surface_configurations(stated or {}, robot, runs)
     inferred_facts.check_priors(priors, robot, runs)
-    as_stated, weighed = robot, inferred_facts.mass_notes(robot, runs)
+    robot_as_stated = robot
+    mass_remarks = inferred_facts.mass_notes(robot, runs)
     robot = inferred_facts.with_table_mass(robot, runs)
-    noise_sds = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
-    noise_sds, larger = noise_room.enlarge_noise(noise_sds, runs)
-    robot = run_grids.measure_initial_states(robot, runs, noise_sds)
-    result = PreparedInput(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
-    names = tuple(choose(result))
+    table_noise = (noise_room.infer_noise if assume else noise_room.noise_from_table)(
+        runs, observe.sizes(runs), noise
+    )
+    table_noise, noise_remarks = noise_room.enlarge_noise(table_noise, runs)
+    robot = run_grids.measure_initial_states(robot, runs, table_noise)
+    prepared = PreparedInput(robot, observe, table_noise, priors, (), (), (), (), tuple(mass_remarks))
+    names = tuple(choose(prepared))
     # The table's masses are compared with those of the file, which are not yet replaced there.
-    checked = checks.check_data(runs, as_stated, names, noise_sds)
-    begins = observe.check_start(runs, noise_sds, robot)
+    table_remarks = checks.check_data(runs, robot_as_stated, names, table_noise)
+    start_remarks = observe.check_start(runs, table_noise, robot)
     return dataclasses.replace(
-        result,
+        prepared,
         names=names,
-        foreign=tuple(inherited_friction_remarks(robot, priors)),
-        checked=(*larger, *checked),
-        begins=tuple(begins),
-        doubted=(*settled, *rig_facts.log_doubts(runs, as_stated)),
+        inherited_remarks=tuple(inherited_friction_remarks(robot, priors)),
+        table_remarks=(*noise_remarks, *table_remarks),
+        start_remarks=tuple(start_remarks),
+        log_remarks=(*settled, *rig_facts.log_doubts(runs, robot_as_stated)),
     )
 
 
@@ -159,23 +171,23 @@ def inherited_friction_remarks(robot: Robot, stated: Collection[str] = ()) -> li
     """
     if not robot.rig.inherits:
         return []
-    own_friction, nominal = map(values_by_name, (robot, paper_robots.nominal()))
+    values, nominal_values = map(values_by_name, (robot, paper_robots.nominal()))
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in paper_robots.nominal().configurations]
     inherited: dict[str, Remark] = {}
-    for part, other, sheet, friction in pairs:
+    for part, other, stated_fields, friction in pairs:
         on_tracks = part in robot.configurations and float(robot.configurations[part].on_tracks) > 0.5
         guides = GUIDES if on_tracks else ()
-        kept_priors = tuple(
+        inherited_names = tuple(
             f"{part}.{name}"
             for name in (*friction, *guides)
-            if own_friction[f"{part}.{name}"] == nominal[f"{other}.{name}"] != 0 and f"{part}.{name}" not in stated
+            if values[f"{part}.{name}"] == nominal_values[f"{other}.{name}"] != 0 and f"{part}.{name}" not in stated
         )
         changed = tuple(
-            (name, own_friction[f"{part}.{name}"], nominal[f"{other}.{name}"])
-            for name in sheet
-            if abs(own_friction[f"{part}.{name}"] / nominal[f"{other}.{name}"] - 1) > DIFFERS
+            (name, values[f"{part}.{name}"], nominal_values[f"{other}.{name}"])
+            for name in stated_fields
+            if abs(values[f"{part}.{name}"] / nominal_values[f"{other}.{name}"] - 1) > DIFFERS
         )
-        if len(kept_priors) > len(inherited[part].kept if part in inherited else ()):
-            inherited[part] = Remark("inherited_priors", part=part, changed=changed, kept=kept_priors)
+        if len(inherited_names) > len(inherited[part].kept if part in inherited else ()):
+            inherited[part] = Remark("inherited_priors", part=part, changed=changed, kept=inherited_names)
     return [note for note in inherited.values() if note.changed]

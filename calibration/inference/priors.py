@@ -198,10 +198,11 @@ def _uncertain_names(robot: Robot, names: Iterable[str]) -> Names:
     A zero is uncertain if the file states its sd. The delay of a rig is uncertain unless stated as exact, because a
     log may be late without the knowledge of its author.
     """
-    fields, exact = parameters_by_name(robot), robot.rig.exact
+    parameters = parameters_by_name(robot)
+    exact = robot.rig.exact
     file_names = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
-    own_names = (n for n in names if n in fields and n not in exact)
-    return tuple(n for n in own_names if float(fields[n].value) != 0.0 or n in file_names)
+    candidates = (n for n in names if n in parameters and n not in exact)
+    return tuple(n for n in candidates if float(parameters[n].value) != 0.0 or n in file_names)
 
 
 def names_to_fit(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
@@ -214,14 +215,14 @@ def names_to_fit(robot: Robot, configurations: Iterable[str], idle: Names = ()) 
         idle: endings of the names of parameters that the data do not show.
     """
     other_configurations = set(robot.configurations) - set(configurations)
-    fields = parameters_by_name(robot)  # a prior may be of an effect that the robot no longer has
-    own_names = [
+    parameters = parameters_by_name(robot)  # a prior may be of an effect that the robot no longer has
+    stated_names = [
         n
         for n, _, sd in robot.rig.priors
-        if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *other_configurations}
+        if sd > 0 and n in parameters and n.partition(".")[0] not in {"rig", *other_configurations}
     ]
     return _drive_names(
-        robot, (n for n in own_names if _leading_parameter(robot, n) is None and not n.endswith(idle))
+        robot, (n for n in stated_names if _leading_parameter(robot, n) is None and not n.endswith(idle))
     )
 
 
@@ -278,7 +279,8 @@ def loop_parameter_names(
         drive, chassis: further parameters that the data determine, see `Observer.free`.
         idle: as in `names_to_fit`.
     """
-    present, fields = set(configurations), parameters_by_name(robot)
+    present = set(configurations)
+    parameters = parameters_by_name(robot)
     names = [
         name
         for c in robot.configurations
@@ -286,18 +288,20 @@ def loop_parameter_names(
         for name in (
             *friction_names(robot, c),
             *([f"{c}.radius"] if robot.shows_travel else []),
-            *(f"{c}.{n}" for n in chassis if f"{c}.{n}" in fields and float(fields[f"{c}.{n}"].value) != 0.0),
+            *(f"{c}.{n}" for n in chassis if f"{c}.{n}" in parameters and float(parameters[f"{c}.{n}"].value) != 0.0),
         )
     ]
     names = [n for n in names if _leading_parameter(robot, n) is None]
-    decided = (*(f".{n}" for n in (*SHAFT, *OF_TURNS)), ".radius")  # above, by what the channels show
-    fitted_names = names_to_fit(robot, present, idle)
-    owned = (n for n in fitted_names if not n.endswith(decided) and ".track." not in n and f".{GROUND}" not in n)
+    ends_above = (*(f".{n}" for n in (*SHAFT, *OF_TURNS)), ".radius")  # above, by what the channels show
+    stated_names = names_to_fit(robot, present, idle)
+    further_names = (
+        n for n in stated_names if not n.endswith(ends_above) and ".track." not in n and f".{GROUND}" not in n
+    )
     return tuple(
         dict.fromkeys(
             [
                 *_uncertain_names(robot, (*_drive_names(robot, (*BENCH, *drive)), *names)),
-                *owned,
+                *further_names,
                 *initial_state_names(robot),
             ]
         )
@@ -336,11 +340,11 @@ def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, Priors]:
     Returns:
         The robot, and (mean, sd) of the guide friction by its name.
     """
-    field = parameters_by_name(robot)
-    of_share, of_friction = f"{configuration}.{GUIDE_SHARE}", f"{configuration}.{GUIDE_FRICTION}"
-    size, share = float(field[of_friction].value), float(field[of_share].value)
-    sd = size * field[of_share].spec.prior_sd(share) / GUIDED
-    return params.replace(robot, {of_share: jnp.asarray(GUIDED)}), {of_friction: (size * share / GUIDED, sd)}
+    parameters = parameters_by_name(robot)
+    share_name, friction_name = f"{configuration}.{GUIDE_SHARE}", f"{configuration}.{GUIDE_FRICTION}"
+    friction, share = float(parameters[friction_name].value), float(parameters[share_name].value)
+    sd = friction * parameters[share_name].spec.prior_sd(share) / GUIDED
+    return params.replace(robot, {share_name: jnp.asarray(GUIDED)}), {friction_name: (friction * share / GUIDED, sd)}
 
 
 def choose_free_names(
@@ -354,11 +358,11 @@ def choose_free_names(
         BadConfiguration: a name is unknown (the message lists the choices), a name is both freed and fixed, or
             nothing is left to fit.
     """
-    everything = list(parameters_by_name(robot))
+    known_names = list(parameters_by_name(robot))
     free_names: list[str] = []
     for word in free:
-        free_names += default if word == "default" else expand_name(word, everything, "--free")
-    fixed = [n for word in fix for n in expand_name(word, everything, "--fix")]
+        free_names += default if word == "default" else expand_name(word, known_names, "--free")
+    fixed = [n for word in fix for n in expand_name(word, known_names, "--fix")]
     conflicting = [word for word in free if word in fix]
     if conflicting:
         raise BadConfiguration(f"--free and --fix both name {conflicting[0]}; name it once")
@@ -373,30 +377,30 @@ def choose_free_names(
     return tuple(names)
 
 
-def expand_name(word: str, everything: list[str], option: str) -> list[str]:
+def expand_name(word: str, names: list[str], option: str) -> list[str]:
     """Parameters that a word stands for: one parameter or, if it ends in `.*`, all below that name.
 
     Raises:
         BadConfiguration: there is no such parameter. The message names the option and the choices.
     """
     if word.endswith(".*"):
-        names_below = [n for n in everything if n.startswith(word[:-1])]
+        names_below = [n for n in names if n.startswith(word[:-1])]
         if names_below:
             return names_below
-        groups = sorted({n.rsplit(".", 1)[0] + ".*" for n in everything})
+        groups = sorted({n.rsplit(".", 1)[0] + ".*" for n in names})
         raise BadConfiguration(f"{option} {word}: no parameters below it; {allowed_words(word, groups)}")
-    if word not in everything:
+    if word not in names:
         raise BadConfiguration(
-            f"{option} {word}: no such parameter; {allowed_words(word, _similar_names(word, everything))}"
+            f"{option} {word}: no such parameter; {allowed_words(word, _similar_names(word, names))}"
         )
     return [word]
 
 
-def _similar_names(word: str, everything: list[str]) -> list[str]:
+def _similar_names(word: str, names: list[str]) -> list[str]:
     """Names to suggest for an unknown one: those with the same last part, or of the same group, or all."""
     last_part = word.rsplit(".", 1)[-1]
-    near = [n for n in everything if last_part and (n.endswith(f".{last_part}") or last_part in n)]
-    return near or [n for n in everything if n.split(".")[0] == word.split(".")[0]] or everything
+    similar = [n for n in names if last_part and (n.endswith(f".{last_part}") or last_part in n)]
+    return similar or [n for n in names if n.split(".")[0] == word.split(".")[0]] or names
 
 
 _PRIOR = re.compile(r"^(?P<name>[\w.-]+)=(?P<value>[^±]+?)(?:±|\+-|\+/-)(?P<sd>.+)$")
@@ -459,33 +463,37 @@ def parameter_coordinates(
             the prior of a free parameter has zero width (value 0 with a relative sd, or stated as exact).
     """
     stated = stated or {}
-    fields = parameters_by_name(robot)
+    parameters = parameters_by_name(robot)
     for name in names:
         if name in robot.rig.exact and name not in stated:
             raise BadConfiguration(f"--free {name}: the robot's file states ± 0; state its ± with --prior")
     for name in stated:
-        if name not in fields:
+        if name not in parameters:
             raise BadConfiguration(
-                f"--prior {name}: no such parameter; {allowed_words(name, _similar_names(name, list(fields)))}"
+                f"--prior {name}: no such parameter; {allowed_words(name, _similar_names(name, list(parameters)))}"
             )
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
-    wide = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
+    relative_sds = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
     surface_configurations = {c for pair in robot.rig.surfaces for c in pair}
-    of_surfaces = {
+    surface_sds = {
         n: SURFACE_OF_RIGS.get(n.split(".", 1)[-1]) for n in names if n.split(".")[0] in surface_configurations
     }
-    wide |= {n: share for n, share in of_surfaces.items() if share is not None}
+    relative_sds |= {n: share for n, share in surface_sds.items() if share is not None}
     if not robot.rig.inherits:
-        wide = {n: sd for n in names for end, sd in RELATIVE_OF_RIGS.items() if n.endswith(end)} | wide
-    known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
-    known_sds |= {**{n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names}, **stated}
-    rows = [_coordinate_of_parameter(fields[name], known_sds.get(name)) for name in names]
+        relative_sds = {
+            n: sd for n in names for end, sd in RELATIVE_OF_RIGS.items() if n.endswith(end)
+        } | relative_sds
+    means_and_sds = {
+        n: (float(parameters[n].value), float(parameters[n].value) * share) for n, share in relative_sds.items()
+    }
+    means_and_sds |= {**{n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names}, **stated}
+    rows = [_coordinate_of_parameter(parameters[name], means_and_sds.get(name)) for name in names]
     *numbers, scale = zip(*rows, strict=True)
     pairs = [(f"{c}.{follower}", f"{c}.{leader}") for c in robot.configurations for follower, leader in TIED]
-    pairs += [(n, leader) for n in fields if (leader := _leading_parameter(robot, n)) is not None]
+    pairs += [(n, leader) for n in parameters if (leader := _leading_parameter(robot, n)) is not None]
     tied = tuple(
-        (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
+        (follower, names.index(leader), float(parameters[follower].value / parameters[leader].value))
         for follower, leader in pairs
         if leader in names and follower not in names
     )
@@ -496,7 +504,7 @@ def parameter_coordinates(
         low,
         high,
         tuple(names),
-        tuple(fields[name].spec.unit for name in names),
+        tuple(parameters[name].spec.unit for name in names),
         scale,
         jnp.asarray([ratio for _, _, ratio in tied]),
         tuple((follower, k) for follower, k, _ in tied),

@@ -117,15 +117,17 @@ class Problem(eqx.Module):
         """Whitened residuals of the readings, then adhesion penalties, at z. Shape (rows (channels + 1),)."""
         return self.whitened(self.observation(z))
 
-    def whitened(self, seen: Observation) -> Float[Array, " residuals"]:
+    def whitened(self, observation: Observation) -> Float[Array, " residuals"]:
         """Whitened residuals of an observation: readings, then adhesion penalties. Shape (rows (channels + 1),)."""
-        error = (seen.reading - self.data.measured) / self.data.sd
+        error = (observation.reading - self.data.measured) / self.data.sd
         error = self.data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
-        return jnp.concatenate([error.ravel(), jax.nn.relu(self.adhesion_excess(seen))])
+        return jnp.concatenate([error.ravel(), jax.nn.relu(self.adhesion_excess(observation))])
 
-    def signed(self, seen: Observation) -> Float[Array, " residuals"]:
+    def signed(self, observation: Observation) -> Float[Array, " residuals"]:
         """Residuals as in `whitened`, but the adhesion penalty is negative for rows within their margin."""
-        return jnp.concatenate([self.whitened(seen)[: self.data.measured.size], self.adhesion_excess(seen)])
+        return jnp.concatenate(
+            [self.whitened(observation)[: self.data.measured.size], self.adhesion_excess(observation)]
+        )
 
     def linearised(
         self, robot: Callable[[Array], Robot], x: Float[Array, " x"]
@@ -148,16 +150,18 @@ class Problem(eqx.Module):
             jacobian, (r, observed) = jax.jacfwd(explicit, has_aux=True)(x)
             return r, jacobian, observed, None
 
-        unknowns, was_found = solved
+        unknowns, is_solved = solved
         size, (rows, count) = x.size, self.data.measured.shape
 
-        def shown(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:
-            observation, signals, residual = self.observe.shown(robot(x[:size]), unknowns + x[size:], was_found)
+        def at_unknowns(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:
+            observation, signals, residual = self.observe.observation_at_unknowns(
+                robot(x[:size]), unknowns + x[size:], is_solved
+            )
             r = self.signed(observation)
             return (r, residual), (r, observation, signals)
 
         x_and_unknowns = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
-        (slope, residual_slope), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(x_and_unknowns)
+        (slope, residual_slope), (r, observed, signals) = jax.jacfwd(at_unknowns, has_aux=True)(x_and_unknowns)
         by_row = slope[: rows * count].reshape(rows, count, -1)
         by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), residual_slope)
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
@@ -166,9 +170,9 @@ class Problem(eqx.Module):
         """True for rows with readings for which the model has no operating point, shape as `status`."""
         return self.observe.unreachable(np.asarray(status)) & (np.asarray(self.data.weight).max(1) > 0)
 
-    def adhesion_excess(self, seen: Observation) -> Float[Array, " rows"]:
+    def adhesion_excess(self, observation: Observation) -> Float[Array, " rows"]:
         """Used adhesion above the margin, in units of the penalty, shape (rows,). Negative within the margin."""
-        excess = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(self.data.weight, 1) / self.data.stiffness
+        excess = (observation.adhesion_used - (1 - MARGIN)) * jnp.max(self.data.weight, 1) / self.data.stiffness
         return jnp.where(jnp.isfinite(excess), excess, 0.0)
 
     def robot(self, z: Float[Array, " parameters"]) -> Robot:

@@ -1,4 +1,4 @@
-"""Check before any fit of whether readings are possible for the robot. Most failures are wrong units."""
+"""Check before any fit that readings are possible for the robot. Most failures are wrong units."""
 
 from __future__ import annotations
 
@@ -61,12 +61,13 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
             confusion of units explains it.
     """
     runs = runs.of(robot)
-    kind = observers.observer_kind(runs)
-    runs, measured, lasts = kind.settled(runs, steady=True)
+    observer = observers.observer_kind(runs)
+    runs, measured, durations = observer.settled(runs, steady=True)
     if not len(runs):
         return []
     _check_masses(runs, robot)
-    runs, measured = runs.where(lasts >= UNDER_WAY), measured[lasts >= UNDER_WAY]
+    runs = runs.where(durations >= UNDER_WAY)
+    measured = measured[durations >= UNDER_WAY]
     if not len(runs) or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return []
     if not robot.rig.inherits:
@@ -74,21 +75,21 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
     conditions = runs.conditions(robot)
     possible = np.stack([operating_readings(_with_friction_factor(robot, f), conditions) for f in FRICTION])
     # A robot that moves with less friction but not with more may stand still: any speed between is possible.
-    slow = np.array([c.zero_at_rest for c in robot.channels])
-    possible = np.where(slow & np.isnan(possible) & np.isfinite(possible[0]), 0.0, possible)
+    is_zero_at_rest = np.array([c.zero_at_rest for c in robot.channels])
+    possible = np.where(is_zero_at_rest & np.isnan(possible) & np.isfinite(possible[0]), 0.0, possible)
     if not np.isfinite(possible).any():
         return []
     factors = {c: _range_factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
     remarks: list[Remark] = []
     for k, (channel, factor) in enumerate(factors.items()):
         ratio = max(factor, 1 / factor)
-        unknown = not robot.rig.inherits and channel.name in OF_TORQUE
-        if ratio <= (FAR if unknown else SAID):
+        has_unknown_friction = not robot.rig.inherits and channel.name in OF_TORQUE
+        if ratio <= (FAR if has_unknown_friction else SAID):
             continue
         units = _possible_units(channel, measured[:, k], possible[:, :, k], robot)
         if not units and (
-            unknown
-            or kind.axis
+            has_unknown_friction
+            or observer.axis
             or (not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1)
         ):  # a sliding vehicle may have other speeds
             continue
@@ -157,9 +158,9 @@ def _sign_remarks_of_readings(runs: Runs, measured: np.ndarray, possible: np.nda
     return remarks if len(remarks) == 1 else []  # with several, the file's values may be wrong instead
 
 
-def _smallest_rms(off: np.ndarray) -> float:
+def _smallest_rms(errors: np.ndarray) -> float:
     """Smallest root mean square over the rows among several robots, shape (robots, rows). inf without numbers."""
-    return min((float(np.sqrt(np.nanmean(x**2))) for x in off if np.isfinite(x).any()), default=math.inf)
+    return min((float(np.sqrt(np.nanmean(x**2))) for x in errors if np.isfinite(x).any()), default=math.inf)
 
 
 def _with_friction_factor(robot: Robot, factor: float) -> Robot:
@@ -183,11 +184,14 @@ def _range_factor(measured: np.ndarray, possible: np.ndarray) -> float:
     if not finite.any():
         return 1.0
     size = np.abs(possible[:, finite])
-    low, high = np.nanmin(size, 0), np.nanmax(size, 0)
-    tells = high > max(SMALL * np.nanmax(high), NOTHING * np.max(np.abs(measured[finite])))
-    if not tells.any():  # a channel that steady travel does not show
+    low = np.nanmin(size, 0)
+    high = np.nanmax(size, 0)
+    is_informative = high > max(SMALL * np.nanmax(high), NOTHING * np.max(np.abs(measured[finite])))
+    if not is_informative.any():  # a channel that steady travel does not show
         return 1.0
-    low, high, x = low[tells], high[tells], np.abs(measured[finite][tells])
+    low = low[is_informative]
+    high = high[is_informative]
+    x = np.abs(measured[finite][is_informative])
     x = np.maximum(x, 1e-9 * high)
     return float(np.median(x / np.clip(x, low, high)))
 
@@ -198,7 +202,7 @@ def _possible_units(channel: Channel, measured: np.ndarray, possible: np.ndarray
     if channel.name == "motor_speed" and robot.has_ground:
         other_units["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
     distance = {unit: abs(math.log(_range_factor(measured / f, possible))) for unit, f in other_units.items()}
-    return sorted((u for u, x in distance.items() if x < math.log(ALIKE)), key=distance.__getitem__)
+    return sorted((u for u, log_factor in distance.items() if log_factor < math.log(ALIKE)), key=distance.__getitem__)
 
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
@@ -214,9 +218,9 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     ratio = float(robot.gearbox.ratio)
     if output is None or abs(math.log(ratio)) < math.log(REFUSED):
         return
-    turns = np.abs(np.asarray(motor)) / np.maximum(np.abs(output), 1e-12)
-    turns = turns[np.isfinite(turns) & (turns > 0)]
-    measured_ratio = float(np.median(turns)) if turns.size else ratio
+    ratios = np.abs(np.asarray(motor)) / np.maximum(np.abs(output), 1e-12)
+    ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
+    measured_ratio = float(np.median(ratios)) if ratios.size else ratio
     if abs(math.log(measured_ratio * ratio)) < math.log(SAID):
         raise BadData(
             f"{runs.source}: the motor turns about {float(f'{measured_ratio:.2g}'):g} times for one turn of the "
@@ -229,13 +233,13 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
     """Rejects total masses that are impossible for the robot."""
     if not runs.has("total_mass_kg"):
         return
-    own_mass = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]
-    factor = float(np.median(runs["total_mass_kg"] / (own_mass + runs["payload_kg"])))
+    robot_mass = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]
+    factor = float(np.median(runs["total_mass_kg"] / (robot_mass + runs["payload_kg"])))
     if max(factor, 1 / factor) > REFUSED:
         ratio, size = (factor, "large") if factor > 1 else (1 / factor, "small")
         raise BadData(
             f"{runs.source}, total_mass_kg: about {float(f'{ratio:.2g}'):g} times too {size} for this robot "
-            f"({', '.join(f'{m:g} kg' for m in np.unique(own_mass))} and the payload); check its unit, kg, and "
+            f"({', '.join(f'{m:g} kg' for m in np.unique(robot_mass))} and the payload); check its unit, kg, and "
             "the robot's mass"
         )
 
@@ -249,16 +253,17 @@ def _slope_unit_remark(runs: Runs, measured: np.ndarray, possible: np.ndarray, r
     k = next((k for k, c in enumerate(robot.channels) if c.name in ("total_current", "motor_current")), None)
     if k is None or "slope_deg" not in runs.axes:
         return
-    slope, finite = runs["slope_deg"], np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])
+    slope = runs["slope_deg"]
+    finite = np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])
     columns = [
         c for c in ("configuration", runs.layout.imposed_column, "payload_kg", "surface", "duty") if runs.has(c)
     ]
-    rows_finite = np.flatnonzero(finite)
-    groups = rows_by_key(tuple(str(runs[c][row]) for c in columns) for row in rows_finite)
-    several = [rows_finite[g] for g in groups.values() if np.ptp(slope[rows_finite[g]]) > 0]
-    if sum(len(g) - 1 for g in several) < 3:
+    finite_rows = np.flatnonzero(finite)
+    groups = rows_by_key(tuple(str(runs[c][row]) for c in columns) for row in finite_rows)
+    groups_with_slopes = [finite_rows[g] for g in groups.values() if np.ptp(slope[finite_rows[g]]) > 0]
+    if sum(len(g) - 1 for g in groups_with_slopes) < 3:
         return
-    x, y = (np.concatenate([v[g, k] - np.mean(v[g, k]) for g in several]) for v in (possible, measured))
+    x, y = (np.concatenate([v[g, k] - np.mean(v[g, k]) for g in groups_with_slopes]) for v in (possible, measured))
     correlation = float(x @ y / math.sqrt(max(float((x @ x) * (y @ y)), 1e-300)))
     rise = float(x @ y / max(float(x @ x), 1e-300))
     for unit, size in SLOPES.items():

@@ -1,7 +1,7 @@
-"""Test of whether the residuals of a fit differ between levels of a column that the model does not use.
+"""Test for residuals of a fit that differ between levels of a column that the model does not use.
 
-A column that the model does not read may still explain which rows differ: which wheel idles, who measured, which
-battery was in. For each channel a variance ratio (Seber and Lee, Linear Regression Analysis (2003), 4.3) compares the
+A column that the model does not read may still explain differences: the idle wheel, the operator, the
+battery. For each channel a variance ratio (Seber and Lee, Linear Regression Analysis (2003), 4.3) compares the
 residuals over the levels of each such column. It does so over all rows, within the levels of each label of the
 conditions, and with opposite signs in the two directions of travel. Columns of many numbers enter by their ranks.
 Free parameters, labels and smooth curves over the conditions are first projected out on both sides. The significance
@@ -119,52 +119,62 @@ def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualClust
     if not columns:
         return ()
     tests_by_channel = {k: _tests_of_channel(residuals, k, columns) for k in range(fit.counts.shape[1])}
-    channel_tests = {k: tests for k, tests in tests_by_channel.items() if tests is not None}
-    count = sum(len(tested.tests) for tested in channel_tests.values())
+    tests_with_readings = {k: tests for k, tests in tests_by_channel.items() if tests is not None}
+    count = sum(len(channel_tests.tests) for channel_tests in tests_with_readings.values())
     significant = {
-        k: [(count * float(p[0]), test) for test, p in tested.p_values(tested.left[:, None]) if count * p[0] < LEVEL]
-        for k, tested in channel_tests.items()
+        k: [
+            (count * float(p[0]), test)
+            for test, p in channel_tests.p_values(channel_tests.residuals[:, None])
+            if count * p[0] < LEVEL
+        ]
+        for k, channel_tests in tests_with_readings.items()
     }
     if not any(significant.values()):
         return ()
     # Smallest p-value of all tests for each permutation of the residuals.
     random = np.random.default_rng(seed)
-    longest = max(len(tested.left) for tested in channel_tests.values())
-    times = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
-    strongest = np.ones(times)
-    for tested in channel_tests.values():
-        permuted = random.permuted(np.repeat(tested.left[:, None], times, 1), axis=0)
-        for _, p_values in tested.p_values(tested.project_out(permuted)):
+    longest = max(len(channel_tests.residuals) for channel_tests in tests_with_readings.values())
+    permutations = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
+    strongest = np.ones(permutations)
+    for channel_tests in tests_with_readings.values():
+        permuted = random.permuted(np.repeat(channel_tests.residuals[:, None], permutations, 1), axis=0)
+        for _, p_values in channel_tests.p_values(channel_tests.project_out(permuted)):
             strongest = np.minimum(strongest, p_values)
     floor = 1 / (1 + len(strongest))
     answer: list[ResidualCluster] = []
-    for k, tested in channel_tests.items():
+    for k, channel_tests in tests_with_readings.items():
         chances = [(p, test, floor * (1 + int(np.sum(strongest <= p / count)))) for p, test in significant[k]]
-        own_chances = sorted(((p if c <= floor else max(p, c)), test) for p, test, c in chances if c <= LEVEL)
+        candidates = sorted(((p if c <= floor else max(p, c)), test) for p, test, c in chances if c <= LEVEL)
         comparisons: list[tuple[float, _Comparison, list[str]]] = []
-        for p, test in _coarse_first(own_chances, columns):
+        for p, test in _coarse_first(candidates, columns):
             if any(test.column in (t.column, *names) for _, t, names in comparisons):
                 continue
-            explains = next((t for t in comparisons if tested.beside(test, t[1]) * count >= LEVEL), None)
-            if explains is None:
+            explaining = next(
+                (t for t in comparisons if channel_tests.p_value_after(test, t[1]) * count >= LEVEL), None
+            )
+            if explaining is None:
                 comparisons.append((p, test, []))
             else:
-                explains[2].append(test.column)
+                explaining[2].append(test.column)
         answer += [_report_cluster(residuals, k, test, p, tuple(names)) for p, test, names in comparisons]
     return tuple(sorted(answer, key=lambda c: c.p))
 
 
-def _coarse_first(found: list[tuple[float, _Comparison]], columns: Columns) -> list[tuple[float, _Comparison]]:
+def _coarse_first(findings: list[tuple[float, _Comparison]], columns: Columns) -> list[tuple[float, _Comparison]]:
     """Findings by their p-values, but with each column before any finer subdivision of its levels."""
-    words = {test.column: _column_as_words(columns[test.column]) for _, test in found}
-    levels = {name for name in words if not _is_numeric(columns[name])}
+    words = {test.column: _column_as_words(columns[test.column]) for _, test in findings}
+    level_columns = {name for name in words if not _is_numeric(columns[name])}
     ordered: list[tuple[float, _Comparison]] = []
-    waiting = list(found)
+    waiting = list(findings)
     while waiting:
         name = waiting[0][1].column
-        coarser = [one for one in waiting if name in levels and _determines(words[name], words[one[1].column])]
+        coarser = [
+            finding
+            for finding in waiting
+            if name in level_columns and _determines(words[name], words[finding[1].column])
+        ]
         ordered.append((coarser or waiting)[0])
-        waiting = [one for one in waiting if one is not ordered[-1]]
+        waiting = [finding for finding in waiting if finding is not ordered[-1]]
     return ordered
 
 
@@ -248,11 +258,12 @@ def _units_by_run(fit: Residuals) -> _ResidualUnits:
     )
 
 
-def _columns_to_test(whole: _ResidualUnits) -> Columns:
+def _columns_to_test(units: _ResidualUnits) -> Columns:
     """Columns to test: those with more than one level that are no ids, times or copies of a condition."""
-    runs, columns = whole.runs, {}
+    runs = units.runs
+    columns = {}
     # Simulated readings depend only on the conditions.
-    conditions = [runs[c] for c in CONDITIONS if runs.has(c)] + list(whole.simulated.T)
+    conditions = [runs[c] for c in CONDITIONS if runs.has(c)] + list(units.simulated.T)
     for name, cells in runs.extras.items():
         words = _column_as_words(cells)
         levels = np.unique(words[words != ""])
@@ -295,8 +306,8 @@ def _are_steps_of_condition(cells: np.ndarray, words: np.ndarray, conditions: Se
     if cells.dtype.kind != "f" or len(np.unique(words)) > LEVELS:
         return False
     for x in conditions:
-        fine = np.isfinite(x) & np.isfinite(cells)
-        levels = [x[fine & (words == w)] for w in np.unique(words[fine])]
+        finite = np.isfinite(x) & np.isfinite(cells)
+        levels = [x[finite & (words == w)] for w in np.unique(words[finite])]
         ends = sorted((level.min(), level.max()) for level in levels)
         if len(ends) > 1 and all(a[1] < b[0] for a, b in itertools.pairwise(ends)):
             return True
@@ -342,15 +353,15 @@ class _ChannelTests:
     """Residuals of a channel, transformed to independent values of equal variance, and their tests.
 
     Attributes:
-        left: residuals after projecting out conditions and parameters, shape (units,).
+        residuals: residuals after projecting out conditions and parameters, shape (units,).
         freedom: degrees of freedom of these residuals.
-        taken: orthonormal directions of conditions and parameters, shape (units, directions).
+        explained_basis: orthonormal directions of conditions and parameters, shape (units, directions).
         tests: tests, each with an orthonormal basis after the same projection.
     """
 
-    left: np.ndarray
+    residuals: np.ndarray
     freedom: int
-    taken: np.ndarray
+    explained_basis: np.ndarray
     tests: tuple[_Comparison, ...]
 
     def p_values(self, residuals: np.ndarray) -> list[tuple[_Comparison, np.ndarray]]:
@@ -360,12 +371,12 @@ class _ChannelTests:
 
     def project_out(self, residuals: np.ndarray) -> np.ndarray:
         """Residuals after projecting out conditions and parameters."""
-        return residuals - self.taken @ (self.taken.T @ residuals)
+        return residuals - self.explained_basis @ (self.explained_basis.T @ residuals)
 
-    def beside(self, test: _Comparison, other: _Comparison) -> float:
+    def p_value_after(self, test: _Comparison, other: _Comparison) -> float:
         """p-value of a test after another one is projected out too. 1 if nothing is left to test."""
         basis = _orthonormal_basis(test.basis - other.basis @ (other.basis.T @ test.basis))
-        residual = self.left - other.basis @ (other.basis.T @ self.left)
+        residual = self.residuals - other.basis @ (other.basis.T @ self.residuals)
         freedom = self.freedom - other.basis.shape[1]
         if basis.shape[1] == 0 or freedom - basis.shape[1] < LEAST:
             return 1.0
@@ -388,39 +399,39 @@ def _orthonormal_basis(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
     return directions[:, size > least]
 
 
-def _tests_of_channel(whole: _ResidualUnits, k: int, columns: Columns) -> _ChannelTests | None:
+def _tests_of_channel(units: _ResidualUnits, k: int, columns: Columns) -> _ChannelTests | None:
     """Tests of a channel. None if it has too few readings."""
-    counts = whole.counts[:, k]
+    counts = units.counts[:, k]
     if counts.sum() < FEWEST:
         return None
-    runs = whole.runs.where(counts)
+    runs = units.runs.where(counts)
     # The residuals' covariance is 1 - J (JᵀJ + 1)⁻¹ Jᵀ, which differs from 1 in only a few directions.
-    j = whole.jacobian[counts, k]
-    root = np.linalg.cholesky(whole.covariance)
-    directions, size, _ = np.linalg.svd(j @ root, full_matrices=False)
+    jacobian = units.jacobian[counts, k]
+    root = np.linalg.cholesky(units.covariance)
+    directions, size, _ = np.linalg.svd(jacobian @ root, full_matrices=False)
     share = np.clip(size**2, 0.0, 1.0)
-    open_ = share < 1 - CLEAR
-    forth = np.where(open_, np.sqrt(1 - share), 0.0)
-    back = np.where(open_, 1 / np.sqrt(np.maximum(1 - share, CLEAR)), 0.0)
+    is_free = share < 1 - CLEAR
+    sd_of_direction = np.where(is_free, np.sqrt(1 - share), 0.0)
+    inverse_sd = np.where(is_free, 1 / np.sqrt(np.maximum(1 - share, CLEAR)), 0.0)
 
-    def scaled(x: np.ndarray, by: np.ndarray) -> np.ndarray:
-        return x + directions @ ((by - 1)[:, None] * (directions.T @ x))
+    def scaled(x: np.ndarray, factors: np.ndarray) -> np.ndarray:
+        return x + directions @ ((factors - 1)[:, None] * (directions.T @ x))
 
-    travel = np.sign(whole.simulated[counts, k])
+    travel = np.sign(units.simulated[counts, k])
     has_both_directions = min(np.sum(travel > 0), np.sum(travel < 0)) >= 2
-    smooth = _condition_columns(runs, whole.simulated[counts], travel if has_both_directions else None)
+    smooth = _condition_columns(runs, units.simulated[counts], travel if has_both_directions else None)
     explained_basis = _orthonormal_basis(
-        np.concatenate([directions[:, ~open_], _unit_columns(scaled(smooth, forth))], 1)
+        np.concatenate([directions[:, ~is_free], _unit_columns(scaled(smooth, sd_of_direction))], 1)
     )
-    whitened = scaled(whole.whitened[counts, k][:, None], back)[:, 0]
+    whitened = scaled(units.whitened[counts, k][:, None], inverse_sd)[:, 0]
     projected = whitened - explained_basis @ (explained_basis.T @ whitened)
     freedom = len(projected) - explained_basis.shape[1]
     tests = []
     for name, cells in columns.items():
         for within in ("", *_condition_labels(runs)):
             for reversing in (False, True)[: 1 + has_both_directions]:
-                shape = _comparison_columns(cells[counts], runs[within] if within else None)
-                basis = scaled(shape * travel[:, None] if reversing else shape, forth)
+                regressors = _comparison_columns(cells[counts], runs[within] if within else None)
+                basis = scaled(regressors * travel[:, None] if reversing else regressors, sd_of_direction)
                 basis = _orthonormal_basis(_unit_columns(basis))
                 basis = _orthonormal_basis(basis - explained_basis @ (explained_basis.T @ basis), OWN)
                 if basis.shape[1] and freedom - basis.shape[1] >= LEAST:
@@ -441,24 +452,24 @@ def _is_numeric(cells: np.ndarray) -> bool:
 
 def _centred_ranks(cells: np.ndarray) -> np.ndarray:
     """Ranks minus their mean, 0 for missing numbers."""
-    fine = np.isfinite(cells)
+    finite = np.isfinite(cells)
     ranks = np.zeros(len(cells))
-    if fine.any():
+    if finite.any():
         from scipy.stats import rankdata  # takes a second to import, and is rarely needed
 
-        ranks[fine] = rankdata(cells[fine]) - (fine.sum() + 1) / 2
+        ranks[finite] = rankdata(cells[finite]) - (finite.sum() + 1) / 2
     return ranks
 
 
 def _comparison_columns(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
     """Regressors of a column: a mean for each of its levels, or a slope over ranks, for each level of `within`."""
-    cell = np.zeros(len(cells), str) if within is None else within
+    label = np.zeros(len(cells), str) if within is None else within
     if _is_numeric(cells):
-        ranks = [_centred_ranks(np.where(cell == c, cells, np.nan)) for c in np.unique(cell)]
+        ranks = [_centred_ranks(np.where(label == c, cells, np.nan)) for c in np.unique(label)]
         return np.stack(ranks, 1)
     words = _column_as_words(cells)
-    cell_masks = [(words == w) & (cell == c) for w in np.unique(words) for c in np.unique(cell)]
-    return np.stack([b for b in cell_masks if b.any()], 1).astype(float)
+    masks = [(words == w) & (label == c) for w in np.unique(words) for c in np.unique(label)]
+    return np.stack([b for b in masks if b.any()], 1).astype(float)
 
 
 def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.ndarray:
@@ -485,34 +496,36 @@ def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | N
     return indicators
 
 
-def _report_cluster(whole: _ResidualUnits, k: int, test: _Comparison, p: float, alike: Names) -> ResidualCluster:
+def _report_cluster(units: _ResidualUnits, k: int, test: _Comparison, p: float, alike: Names) -> ResidualCluster:
     """Finding in the units of its channel."""
-    channel, counts = whole.runs.channels[k], whole.counts[:, k]
-    cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor
-    signed = residual * np.sign(whole.simulated[counts, k]) if test.reversing else residual
-    within = whole.runs[test.within][counts] if test.within else np.zeros(int(counts.sum()), str)
-    words, correlation = _column_as_words(cells), None
+    channel, counts = units.runs.channels[k], units.counts[:, k]
+    cells = units.runs.extras[test.column][counts]
+    residual = units.residual[counts, k] / channel.factor
+    signed = residual * np.sign(units.simulated[counts, k]) if test.reversing else residual
+    within = units.runs[test.within][counts] if test.within else np.zeros(int(counts.sum()), str)
+    words = _column_as_words(cells)
+    correlation = None
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
     if _is_numeric(cells):
         from scipy.stats import spearmanr
 
-        fine = np.isfinite(cells)
-        correlation = float(spearmanr(cells[fine], signed[fine]).statistic)
+        finite = np.isfinite(cells)
+        correlation = float(spearmanr(cells[finite], signed[finite]).statistic)
     else:
         keys = sorted(
             set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _level_order(x[1]))
         )
         groups = [(w, c, signed[(within == c) & (words == w)]) for c, w in keys]
         levels = tuple(LevelMean(w, c, float(group.mean()), len(group)) for w, c, group in groups)
-    coarser = () if _is_numeric(cells) else _coarser_columns(whole, k, test.column, words, within, signed)
+    coarser = () if _is_numeric(cells) else _coarser_columns(units, k, test.column, words, within, signed)
     return ResidualCluster(
         test.column, channel.name, channel.unit, test.within, test.reversing, levels, correlation, p, alike, coarser
     )
 
 
 def _coarser_columns(
-    whole: _ResidualUnits, k: int, column: str, words: np.ndarray, within: np.ndarray, residual: np.ndarray
+    units: _ResidualUnits, k: int, column: str, words: np.ndarray, within: np.ndarray, residual: np.ndarray
 ) -> tuple[tuple[str, float], ...]:
     """Columns that the column of a finding subdivides and that explain most of its differences."""
 
@@ -526,14 +539,16 @@ def _coarser_columns(
                 total += in_cell.sum() * (residual[in_cell].mean() - residual[in_level].mean()) ** 2
         return total
 
-    shares, whole_chi2, counts = {}, between(words), whole.counts[:, k]
-    for name, cells in whole.runs.extras.items():
+    shares = {}
+    sum_between_levels = between(words)
+    counts = units.counts[:, k]
+    for name, cells in units.runs.extras.items():
         if name == column or _is_numeric(cells[counts]):
             continue
         coarse = _column_as_words(cells[counts])
-        if len(np.unique(coarse)) > 1 and _determines(words, coarse) and whole_chi2 > 0:
-            shares[name] = float(between(coarse) / whole_chi2)
-    return tuple(sorted(((n, x) for n, x in shares.items() if x >= MOSTLY), key=lambda one: -one[1]))
+        if len(np.unique(coarse)) > 1 and _determines(words, coarse) and sum_between_levels > 0:
+            shares[name] = float(between(coarse) / sum_between_levels)
+    return tuple(sorted(((n, x) for n, x in shares.items() if x >= MOSTLY), key=lambda entry: -entry[1]))
 
 
 def _level_order(word: str) -> tuple[float, str]:

@@ -333,8 +333,8 @@ class CalibrationResult:
         """
         groups: dict[str, Names] = {}
         for kind, block_errors in self.held_out.items():
-            like = next((k for k in groups if self._same(self.held_out[k], block_errors)), None)
-            groups |= {kind: ()} if like is None else {like: (*groups[like], kind)}
+            same_kind = next((k for k in groups if self._same(self.held_out[k], block_errors)), None)
+            groups |= {kind: ()} if same_kind is None else {same_kind: (*groups[same_kind], kind)}
         return groups
 
     def _same(self, one: HeldOutErrors, other: HeldOutErrors) -> bool:
@@ -361,7 +361,9 @@ class CalibrationResult:
 
     def to_json(self) -> Json:
         """Content of result.json, as described in docs/schemas/calibrate.schema.json."""
-        about, main, entries = self.identifiability, self.main_blocks, functools.partial(writing.entries_of, self)
+        analysis = self.identifiability
+        main = self.main_blocks
+        entries = functools.partial(writing.entries_of, self)
         return writing.json_value(
             {
                 "schema": SCHEMA,
@@ -393,11 +395,11 @@ class CalibrationResult:
                 **entries("chi2=chi_square", "adequate=adequacy", "residual_clusters"),
                 "identifiability": {
                     **entries("singular_values=identifiability.singular_values", "rank=identifiability.rank"),
-                    "directions_better_known_from_data": int(np.sum(about.singular_values > 1)),
+                    "directions_better_known_from_data": int(np.sum(analysis.singular_values > 1)),
                     "weak_directions": [
-                        {"singular_value": s, "components": main} for s, main in about.weak_directions()
+                        {"singular_value": s, "components": main} for s, main in analysis.weak_directions()
                     ],
-                    "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in about.correlated()],
+                    "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in analysis.correlated()],
                     "together": self.together,
                 },
                 "statuses_before": _status_counts(self.status_before),
@@ -418,7 +420,8 @@ class CalibrationResult:
     def _readings(self) -> Iterator[tuple[str, np.ndarray]]:
         main = self.main_blocks
         for channel in self.channels:
-            r, column = self.readings[channel.name], channel.column
+            r = self.readings[channel.name]
+            column = channel.column
             yield column, r.measured / channel.factor
             yield channel.sd_column, r.sd / channel.factor
             yield f"before_{column}", r.before / channel.factor

@@ -60,13 +60,16 @@ class Scan:
         places_inside = np.flatnonzero(self._inside)
         return self._crossing(places_inside[0], -1), self._crossing(places_inside[-1], 1)
 
-    def _crossing(self, k: int, side: int) -> float:
+    def _crossing(self, inner: int, side: int) -> float:
         """Coordinate between point k (inside) and the next one at which the rise is 3.84, or the end point."""
-        if not 0 <= k + side < len(self.at):
-            return float(self.at[k])
-        inner_root, outer_root = (np.sqrt(max(2 * (self.cost[j] - self.cost.min()), 0.0)) for j in (k, k + side))
+        if not 0 <= inner + side < len(self.at):
+            return float(self.at[inner])
+        inner_root, outer_root = (
+            np.sqrt(max(2 * (self.cost[j] - self.cost.min()), 0.0)) for j in (inner, inner + side)
+        )
         return float(
-            self.at[k] + (self.at[k + side] - self.at[k]) * (Z95 - inner_root) / max(outer_root - inner_root, 1e-12)
+            self.at[inner]
+            + (self.at[inner + side] - self.at[inner]) * (Z95 - inner_root) / max(outer_root - inner_root, 1e-12)
         )
 
     def open(self) -> tuple[bool, bool]:
@@ -89,7 +92,8 @@ def wide_coordinates(problem: Problem) -> tuple[int, ...]:
     """Indices of the coordinates whose prior is wider than one local minimum of the misfit, according to their fields
     (`Spec.scanned`).
     """
-    fields, c = parameters_by_name(problem.base), problem.coordinates
+    fields = parameters_by_name(problem.base)
+    c = problem.coordinates
     values = [c.value(np.full(len(c), side * RANGE)) for side in (-1.0, 1.0)]
     half = 0.5 * (values[1] - values[0])
     widths = [fields[n].spec.scanned if n in fields else None for n in c.names]
@@ -103,23 +107,24 @@ def scan_coordinate(problem: Problem, z: np.ndarray, k: int) -> Scan:
     """
     count = problem.observe.number_of_scan_points(problem, k)
     scan = _scan_at(problem, z, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
-    around, few = np.array([z[k], *scan.at[scan.local_minima()]])[:CLOSER], count // CLOSER
-    close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
-    if few > 2:
-        scan = _scan_at(problem, z, k, np.resize(close, count), scan)
+    minima = np.array([z[k], *scan.at[scan.local_minima()]])[:CLOSER]
+    points_per_minimum = count // CLOSER
+    near_minima = (minima[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, points_per_minimum)).ravel()
+    if points_per_minimum > 2:
+        scan = _scan_at(problem, z, k, np.resize(near_minima, count), scan)
     low, high = scan.interval()
     return _scan_at(problem, z, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count), scan)
 
 
-def _scan_at(problem: Problem, z: np.ndarray, k: int, at: np.ndarray, before: Scan | None = None) -> Scan:
+def _scan_at(problem: Problem, z: np.ndarray, k: int, values: np.ndarray, before: Scan | None = None) -> Scan:
     """Scan with further points."""
-    at = np.clip(at, -RANGE, RANGE)
-    points = at, *map(np.asarray, problem.observe.scan(problem, jnp.asarray(z), k, jnp.asarray(at)))
+    values = np.clip(values, -RANGE, RANGE)
+    points = values, *map(np.asarray, problem.observe.scan(problem, jnp.asarray(z), k, jnp.asarray(values)))
     if before is not None:
         points = tuple(np.concatenate(x) for x in zip((before.at, before.cost, before.others), points, strict=True))
     order = np.unique(points[0], return_index=True)[1]
-    at, cost, others = (x[order] for x in points)
-    return Scan(at, np.where(np.isfinite(cost), cost, np.inf), others)
+    values, cost, others = (x[order] for x in points)
+    return Scan(values, np.where(np.isfinite(cost), cost, np.inf), others)
 
 
 def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
@@ -133,52 +138,53 @@ def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) ->
     return starts
 
 
-Found = tuple[Optimum, Observation]
+SearchEnd = tuple[Optimum, Observation]
 
 
 def search_lower_minima(
-    problem: Problem, found: Found, search: Callable[[np.ndarray], Found], tell: Callable[[Remark], None]
-) -> Found:
+    problem: Problem, best: SearchEnd, search: Callable[[np.ndarray], SearchEnd], tell: Callable[[Remark], None]
+) -> SearchEnd:
     """Scans the optimum of a search, and repeats the search from any lower minimum.
 
-    It has converged if no scanned minimum is lower and the other coordinates bring no gain, even if the gradient at a
-    step of the staircase is not zero.
+    It has converged if no scanned minimum is lower and the other coordinates bring no gain. The gradient at a step of
+    the staircase need not be zero.
 
     Args:
-        found: optimum of a search, and the observation there.
+        best: optimum of a search, and the observation there.
         search: function that searches from a start.
     """
     coordinates = problem.observe.scanned(problem)
     if not coordinates:
-        return found
+        return best
 
     def objective(z: np.ndarray) -> float:
         cost = 0.5 * float(jnp.sum(evaluate_residuals(problem, jnp.asarray(z)) ** 2))
         return cost if np.isfinite(cost) else np.inf
 
     for _ in range(AGAIN):
-        cost_here, z = float(found[0].cost), np.asarray(found[0].z)
-        looked = {k: scan_coordinate(problem, z, k) for k in coordinates}
-        lower = found
-        for k, scan in looked.items():
+        cost_here = float(best[0].cost)
+        z = np.asarray(best[0].z)
+        scans = {k: scan_coordinate(problem, z, k) for k in coordinates}
+        lower = best
+        for k, scan in scans.items():
             for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:
                 start = np.where(np.arange(len(z)) == k, scan.at[j], z)
-                end = search(min((scan.others[j], start), key=objective))
-                lower = min(lower, end, key=lambda f: float(f[0].cost))
+                candidate = search(min((scan.others[j], start), key=objective))
+                lower = min(lower, candidate, key=lambda search_end: float(search_end[0].cost))
         if not float(lower[0].cost) < cost_here - WORTH:
             break
-        found = lower
+        best = lower
         scanned_names = " or ".join(problem.coordinates.names[k] for k in coordinates)
-        tell(progress_remark("basin", scanned_names, float(found[0].cost)))
+        tell(progress_remark("basin", scanned_names, float(best[0].cost)))
     else:
-        return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
+        return dataclasses.replace(best[0], converged=jnp.asarray(False)), best[1]
     # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.
-    lowest = min(float(scan.cost.min()) for scan in looked.values())
-    sd = np.array(found[0].sd)
-    for k, scan in looked.items():
+    lowest = min(float(scan.cost.min()) for scan in scans.values())
+    sd = np.array(best[0].sd)
+    for k, scan in scans.items():
         sd[k] = scan.sd()
-    settled = bool(found[0].converged) or cost_here - lowest < WORTH
-    return dataclasses.replace(found[0], converged=jnp.asarray(settled), sd=jnp.asarray(sd)), found[1]
+    has_converged = bool(best[0].converged) or cost_here - lowest < WORTH
+    return dataclasses.replace(best[0], converged=jnp.asarray(has_converged), sd=jnp.asarray(sd)), best[1]
 
 
 def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:

@@ -1,7 +1,7 @@
-"""Noise that nobody states, estimated from the scatter of readings along series of conditions or over time.
+"""Noise without a stated sd, estimated from the scatter of readings along series of conditions or over time.
 
-Along a series, rows that differ in one condition only, a model's readings are smooth. So they are over time, except
-where what is imposed or dry friction jumps, and these few differences are left out. The difference of a reading
+A series is rows that differ in one condition only. Along it, readings of a model are smooth. They are also smooth
+over time, except at jumps of an imposed quantity or of dry friction, which are left out. The difference of a reading
 from the line between its neighbours is noise, plus curvature if the steps are wide. So the estimate may be too
 large, never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941). Gasser, Sroka and
 Jennen-Steinmetz, Biometrika 73 (1986), for any spacing).
@@ -81,27 +81,29 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
     """
     if runs.sampled:  # of all rows of a thinned log, with sizes that are those of the channels
         runs = runs.whole
-        sizes, by_axis = np.tile(sizes[:1], (len(runs), 1)), {TIME: list(runs.rows_by_run().values())}
+        sizes = np.tile(sizes[:1], (len(runs), 1))
+        by_axis = {TIME: list(runs.rows_by_run().values())}
     else:
         by_axis = {axis: series_along(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
     measured = runs.measured()
     noises: list[SeriesNoise | None] = []
     for k, channel in enumerate(runs.channels):
-        channel_noises = [
-            _noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()
+        estimates = [
+            _noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, series)
+            for a, series in by_axis.items()
         ]
-        enough = [e for e in channel_noises if e is not None and e.freedom >= FEWEST]
-        preferred = next((e for e in enough if e.axis == FIRST), None)
-        noises.append(preferred or max(enough, key=lambda e: e.freedom, default=None))
+        sufficient = [e for e in estimates if e is not None and e.freedom >= FEWEST]
+        preferred = next((e for e in sufficient if e.axis == FIRST), None)
+        noises.append(preferred or max(sufficient, key=lambda e: e.freedom, default=None))
     return tuple(noises)
 
 
 def rows_by_key(keys: Iterable[Hashable]) -> dict[Any, np.ndarray]:
     """Rows with each key, from the key of each row."""
-    together: dict[Any, list[int]] = {}
+    rows_of_key: dict[Any, list[int]] = {}
     for row, key in enumerate(keys):
-        together.setdefault(key, []).append(row)
-    return {key: np.array(rows) for key, rows in together.items()}
+        rows_of_key.setdefault(key, []).append(row)
+    return {key: np.array(rows) for key, rows in rows_of_key.items()}
 
 
 def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
@@ -110,16 +112,16 @@ def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
     Voltages that differ only by the sag of the supply are one level.
     """
     other_columns = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
-    level = {c: voltage_levels(runs[c]) if c == SUPPLY else runs[c] for c in other_columns}
+    levels = {c: voltage_levels(runs[c]) if c == SUPPLY else runs[c] for c in other_columns}
     driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]
     keys = (
-        (*(str(level[c][row]) for c in other_columns), *(float(np.sign(runs[c][row])) for c in driving))
+        (*(str(levels[c][row]) for c in other_columns), *(float(np.sign(runs[c][row])) for c in driving))
         for row in range(len(runs))
     )
-    together = list(rows_by_key(keys).values())
+    groups = list(rows_by_key(keys).values())
     if runs.has("mode"):
-        together = [rows for rows in together if runs["mode"][rows[0]] == DRIVEN[0]]
-    return [rows for rows in together if len(rows) > 2]
+        groups = [rows for rows in groups if runs["mode"][rows[0]] == DRIVEN[0]]
+    return [rows for rows in groups if len(rows) > 2]
 
 
 def voltage_levels(voltage: np.ndarray) -> np.ndarray:
@@ -148,26 +150,28 @@ def _noise_of_channel(
     that of the mixture by 2.2. Instruments of motors at rest show 0 without noise, so such readings do not count.
     """
     measured = np.where(channel.zero_at_rest & (measured == 0), np.nan, measured)
-    weights, rows_used = _differences_from_neighbours(measured, x, series)
-    if not rows_used:
+    weights, series_count = _differences_from_neighbours(measured, x, series)
+    if not series_count:
         return None
     difference = weights @ np.nan_to_num(measured)
-    smallest_sd = float(display_step(measured, channel) / np.sqrt(12))
+    rounding_sd = float(display_step(measured, channel) / np.sqrt(12))
     forms = []
     for in_share in (False, True) if np.ptp(sizes) else (False,):
         scale = weights.multiply(sizes[None]) if in_share else weights
         spread = np.sqrt(scale.power(2).sum(1))
-        unit, scale = difference / spread, sparse.csr_array(scale.multiply(1 / spread[:, None]))
-        is_valid, size = _sound_differences(unit, JUMP if axis == TIME else WRONG)
-        scale, count = scale[is_valid], int(is_valid.sum())
-        together = scale @ scale.T
-        freedom = count**2 / float(together.power(2).sum())
-        likely = -freedom * float(np.mean(np.log(np.maximum(size * spread[is_valid], np.finfo(float).tiny))))
-        forms.append((likely, size, freedom))
-    likely, size, freedom = np.array(forms).T
-    probability = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
-    floor, *share = (np.sqrt(probability) * size * (probability > NEGLIGIBLE)).tolist()
-    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, rows_used, smallest_sd)
+        standardised = difference / spread
+        scale = sparse.csr_array(scale.multiply(1 / spread[:, None]))
+        is_valid, sd = _sound_differences(standardised, JUMP if axis == TIME else WRONG)
+        scale = scale[is_valid]
+        count = int(is_valid.sum())
+        correlations = scale @ scale.T
+        freedom = count**2 / float(correlations.power(2).sum())
+        log_likelihood = -freedom * float(np.mean(np.log(np.maximum(sd * spread[is_valid], np.finfo(float).tiny))))
+        forms.append((log_likelihood, sd, freedom))
+    log_likelihood, sd, freedom = np.array(forms).T
+    probability = np.exp(log_likelihood - log_likelihood.max()) / np.exp(log_likelihood - log_likelihood.max()).sum()
+    floor, *share = (np.sqrt(probability) * sd * (probability > NEGLIGIBLE)).tolist()
+    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, series_count, rounding_sd)
 
 
 def _differences_from_neighbours(
@@ -178,7 +182,8 @@ def _differences_from_neighbours(
 
     The weights have the shape (differences, rows). Only series with at least one difference are counted.
     """
-    differences, rows_used = [], 0
+    differences = []
+    series_count = 0
     for rows in series:
         rows = rows[np.isfinite(measured[rows])]
         rows = rows[np.argsort(x[rows], kind="stable")]
@@ -187,25 +192,25 @@ def _differences_from_neighbours(
         share = np.where(span > 0, (x[after] - x[middle]) / np.where(span > 0, span, 1.0), 0.5)
         k = np.tile(np.arange(len(middle)), 3)
         weights = np.concatenate([-share, np.ones(len(middle)), share - 1.0])
-        second_differences = k, np.concatenate([before, middle, after])
-        differences.append(sparse.csr_array((weights, second_differences), (len(middle), len(measured))))
-        rows_used += bool(len(middle))
+        coordinates = k, np.concatenate([before, middle, after])
+        differences.append(sparse.csr_array((weights, coordinates), (len(middle), len(measured))))
+        series_count += bool(len(middle))
     return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array(
         (0, len(measured))
-    ), rows_used
+    ), series_count
 
 
-def _sound_differences(unit: np.ndarray, limit: float) -> tuple[np.ndarray, float]:
+def _sound_differences(standardised: np.ndarray, limit: float) -> tuple[np.ndarray, float]:
     """True for differences within so many of their sds, and this sd, that of a normal distribution so truncated.
 
     All differences if too many would lie beyond.
     """
     density = np.exp(-(limit**2) / 2) / np.sqrt(2 * np.pi)
     share = np.sqrt(1 - 2 * limit * density / (2 * ndtr(limit) - 1))
-    size = 1.4826 * float(np.median(np.abs(unit)))
+    sd = 1.4826 * float(np.median(np.abs(standardised)))
     for _ in range(CUTS):
-        is_valid = np.abs(unit) <= limit * size
+        is_valid = np.abs(standardised) <= limit * sd
         if np.mean(~is_valid) > MOST:
-            return np.ones(len(unit), bool), float(np.sqrt(np.mean(unit**2)))
-        size = float(np.sqrt(np.mean(unit[is_valid] ** 2)) / share)
-    return is_valid, size
+            return np.ones(len(standardised), bool), float(np.sqrt(np.mean(standardised**2)))
+        sd = float(np.sqrt(np.mean(standardised[is_valid] ** 2)) / share)
+    return is_valid, sd

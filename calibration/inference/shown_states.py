@@ -41,7 +41,7 @@ JUMP, KINK, GAP = 0.05, 0.3, 3.0
 REST_SD, REST = 5.0, 0.02
 #: Noise of the slope of an angle, as a share of its usual size; most rows whose slope it is.
 STEEP, STEEPEST = 0.02, 201
-#: Change of a delay from which its effect is extrapolated, at most [rows].
+#: Largest change of a delay for which its effect is extrapolated [rows].
 REACH = 2.0
 #: Width added to both ends of an interval, so that a single row has one [rows].
 EDGE = 1e-4
@@ -117,12 +117,12 @@ def state_plan_or_reason(robot: Robot, channels_read: Mapping[int, Channel], pul
     if not (speeds or angles):
         return "motion"
     motion = (*speeds, *angles)[0]
-    slips = [
+    travel_speeds = [
         k
         for k in speeds[1:]
         if robot.has_ground and _shows_travel(channels_read[k]) and not _shows_travel(channels_read[motion])
     ]
-    others = (*slips, *(voltages if imposed == "motor_current" else ()))
+    others = (*travel_speeds, *(voltages if imposed == "motor_current" else ()))
     return StatePlan(current, motion, not speeds, _shows_travel(channels_read[motion]), others, imposed)
 
 
@@ -136,14 +136,14 @@ class LogPoints(eqx.Module):
 
     Attributes:
         conditions: mean conditions over the interval of each point.
-        shown: readings [SI], averaged over the rows of each point.
+        readings: readings [SI], averaged over the rows of each point.
         sd: standard deviation of these averages.
         rate: time derivative of the motion channel, if that is an angle [SI/s].
         way: direction of travel, 0 if the robot may be at rest.
         angle: angle of the output since the first row of the run [rad].
         since: time since the previous point [s], 0 for the first of a run.
         time: time since the start of the run [s].
-        first: index of a table row at the point.
+        table_row: index of the table row in the middle of the point.
         delay: delay of the rig for which the conditions were computed [s].
         drift: derivatives of the conditions with respect to the delay, by field.
         reach: change of the delay within which these derivatives hold [s].
@@ -151,14 +151,14 @@ class LogPoints(eqx.Module):
     """
 
     conditions: Conditions
-    shown: Float[Array, "points channels"]
+    readings: Float[Array, "points channels"]
     sd: Float[Array, "points channels"]
     rate: Float[Array, " points"]
     way: Float[Array, " points"]
     angle: Float[Array, " points"]
     since: Float[Array, " points"]
     time: Float[Array, " points"]
-    first: Int[Array, " points"]
+    table_row: Int[Array, " points"]
     delay: Float[Array, " points"]
     reach: Float[Array, " points"]
     drift: Mapping[str, Float[Array, " points"]]
@@ -166,7 +166,8 @@ class LogPoints(eqx.Module):
 
     def imposed(self, delay: Scalar) -> Conditions:
         """Conditions at another delay, limited to `reach`. Can be differentiated."""
-        conditions, shift = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
+        conditions = self.conditions
+        shift = jnp.clip(delay - self.delay, -self.reach, self.reach)
         for name, drift in self.drift.items():
             conditions = with_condition(conditions, name, getattr(conditions, name) + shift * drift)
         return conditions
@@ -194,8 +195,10 @@ class ImposedCourse:
     cell: np.ndarray
 
     def at(self, delay: float) -> tuple[Columns, Columns]:
-        """Mean of each quantity over the interval of each point, if it acts `delay` [s] later than its column states,
-        and the derivative of the mean with respect to the delay.
+        """Mean of each quantity over the interval of each point, and its derivative with respect to the delay.
+
+        Args:
+            delay: time by which a quantity acts later than its column states [s].
         """
         low, high = (edge - delay for edge in self.cell.T)
         inner = 1e-3 * (high - low)  # an interval may end at a jump
@@ -231,16 +234,16 @@ class RunWindows:
         return RunWindows(self.run, *(x[which] for x in arrays))
 
 
-def join_windows(cut: list[RunWindows], more: int = 0) -> RunWindows:
-    """Windows of all runs, padded to one length, and `more` empty ones."""
-    longest = max(w.rows.shape[1] for w in cut)
+def join_windows(windows: list[RunWindows], empty: int = 0) -> RunWindows:
+    """Windows of all runs, padded to one length, followed by `empty` windows without weight."""
+    longest = max(w.rows.shape[1] for w in windows)
 
     def joined(name: str) -> np.ndarray:
         parts = []
-        for x in (getattr(w, name) for w in cut):
-            missing = (0, 0), (0, longest - x.shape[1])
-            parts.append(np.pad(x, missing, "edge") if name in ("rows", "steps") else np.pad(x, missing))
-        return np.concatenate([*parts, np.full((more, longest), float(name == "steps")).astype(parts[0].dtype)])
+        for x in (getattr(w, name) for w in windows):
+            padding = (0, 0), (0, longest - x.shape[1])
+            parts.append(np.pad(x, padding, "edge") if name in ("rows", "steps") else np.pad(x, padding))
+        return np.concatenate([*parts, np.full((empty, longest), float(name == "steps")).astype(parts[0].dtype)])
 
     return RunWindows(-1, *(joined(n) for n in ("rows", "weight", "slope", "bend", "steps")))
 
@@ -255,25 +258,26 @@ def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.nd
         share: positions s.
         length: length of the window [s].
     """
-    s, c = np.sin(np.pi * share), np.cos(np.pi * share)
+    s = np.sin(np.pi * share)
+    c = np.cos(np.pi * share)
     is_inside = (share > 0) & (share < 1)
     rise = np.pi / length
     derivatives = s**8, 8 * rise * s**7 * c, 8 * rise**2 * s**6 * (7 * c**2 - s**2)
     return tuple(np.where(is_inside, x, 0.0) for x in derivatives)  # type: ignore[return-value]
 
 
-def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def windows_of_run(time: np.ndarray, segment: np.ndarray, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Windows of one run, each as (indices of its points, their positions in the window from 0 to 1).
 
     Args:
         time: times of the points [s], increasing.
-        piece: number of the segment of each point, -1 for points in no window. A window lies within one segment.
+        segment: number of the segment of each point, -1 for points in no window. A window lies within one segment.
         length: length of a window [s]. A shorter segment has one window of its own length.
     """
     windows = list[tuple[np.ndarray, np.ndarray]]()
-    starts = np.flatnonzero(np.r_[True, np.diff(piece) != 0])
-    for begin, end in zip(starts, np.r_[starts[1:], len(piece)], strict=True):
-        if piece[begin] < 0 or end - begin < FEWEST:
+    starts = np.flatnonzero(np.r_[True, np.diff(segment) != 0])
+    for begin, end in zip(starts, np.r_[starts[1:], len(segment)], strict=True):
+        if segment[begin] < 0 or end - begin < FEWEST:
             continue
         times = time[begin:end]
         duration = times[-1] - times[0]
@@ -300,30 +304,31 @@ def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float
     if len(time) < FEWEST or signal_variance <= 0:
         return 0.0
     lags = np.unique(np.geomspace(1, len(time) // 2, 60).astype(int))
-    changed = np.array([np.mean((speed[k:] - speed[:-k]) ** 2) for k in lags]) - 2 * noise**2
-    beyond = np.flatnonzero(changed >= signal_variance)
-    lag = lags[beyond[0]] if len(beyond) else lags[-1]
+    mean_square_change = np.array([np.mean((speed[k:] - speed[:-k]) ** 2) for k in lags]) - 2 * noise**2
+    lags_beyond = np.flatnonzero(mean_square_change >= signal_variance)
+    lag = lags[lags_beyond[0]] if len(lags_beyond) else lags[-1]
     return 0.0 if lag == 1 else float(lag * np.median(np.diff(time)))
 
 
-def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
+def local_slopes(time: np.ndarray, values: np.ndarray, segment: np.ndarray, count: int) -> np.ndarray:
     """Slope at each point of a cubic through the `count` points around it, within its segment."""
     slopes = np.zeros(len(time))
-    starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
-    for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True):
+    starts = np.flatnonzero(np.r_[len(segment) > 0, np.diff(segment) != 0])
+    for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(segment)], strict=True):
         width = min(count, end - begin)
         if width < FEWEST // 2:
             slopes[begin:end] = np.gradient(values[begin:end], time[begin:end]) if width > 1 else 0.0
             continue
         low = np.clip(np.arange(begin, end) - width // 2, begin, end - width)
         for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * width // 1_000_000):
-            near, row_index = low[part][:, None] + np.arange(width), (begin + part)[:, None]
-            away = time[near] - time[row_index]
-            scale = np.abs(away).max()
-            powers = (away / scale)[:, :, None] ** np.arange(4)
+            neighbours = low[part][:, None] + np.arange(width)
+            row_index = (begin + part)[:, None]
+            time_offsets = time[neighbours] - time[row_index]
+            scale = np.abs(time_offsets).max()
+            powers = (time_offsets / scale)[:, :, None] ** np.arange(4)
             normal = np.einsum("nwi,nwj->nij", powers, powers)
-            rise = np.einsum("nwi,nw->ni", powers, values[near] - values[row_index])
-            slopes[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
+            moments = np.einsum("nwi,nw->ni", powers, values[neighbours] - values[row_index])
+            slopes[begin + part] = np.linalg.solve(normal, moments[..., None])[:, 1, 0] / scale
     return slopes
 
 
@@ -332,11 +337,12 @@ def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, flo
 
     The noise of the slope is then `STEEP` of its size.
     """
-    step, far = float(np.median(np.diff(time))), max(len(time) // 20, 1)
-    speed = float(np.sqrt(np.mean((angle[far:] - angle[:-far]) ** 2))) / (far * step)
-    rows = np.ceil((12 * (sd / max(STEEP * speed * step, 1e-300)) ** 2) ** (1 / 3))
-    rows = int(np.clip(rows, FEWEST, STEEPEST)) | 1
-    return rows, sd * (75 / rows**3) ** 0.5 / step  # of a cubic
+    step = float(np.median(np.diff(time)))
+    lag = max(len(time) // 20, 1)
+    speed = float(np.sqrt(np.mean((angle[lag:] - angle[:-lag]) ** 2))) / (lag * step)
+    count = np.ceil((12 * (sd / max(STEEP * speed * step, 1e-300)) ** 2) ** (1 / 3))
+    count = int(np.clip(count, FEWEST, STEEPEST)) | 1
+    return count, sd * (75 / count**3) ** 0.5 / step  # of a cubic
 
 
 class _LogArrays:
@@ -349,19 +355,21 @@ class _LogArrays:
         self.measured, self.sd = (np.asarray(x, float) for x in (problem.data.measured, problem.data.sd))
         states = [k for k in (plan.current, plan.motion if plan.mechanical else -1, *plan.others) if k >= 0]
         weight = np.asarray(problem.data.weight)
-        of_runs = [rows[rows >= 0] for rows in np.asarray(observe.rows_of)]
-        self.each = [rows[np.all(weight[rows][:, states] > 0, 1)] for rows in of_runs]
-        long = [np.diff(self.time[rows]) for rows in self.each if len(rows) > 1]
-        self.step = float(np.median(np.concatenate(long))) if long else 1.0
+        rows_of_runs = [rows[rows >= 0] for rows in np.asarray(observe.rows_of)]
+        self.rows_of_runs = [rows[np.all(weight[rows][:, states] > 0, 1)] for rows in rows_of_runs]
+        time_steps = [np.diff(self.time[rows]) for rows in self.rows_of_runs if len(rows) > 1]
+        self.step = float(np.median(np.concatenate(time_steps))) if time_steps else 1.0
 
     def motion(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Time and speed in some rows of a run, and the noise of the speed (sd). The speed is in the unit of the
         motion channel.
         """
-        plan, time = self.plan, self.time[rows]
+        plan = self.plan
+        time = self.time[rows]
         if not plan.mechanical:
             return time, np.asarray(self.of_rows.motor_speed)[rows], 0.0
-        readings, sd = self.measured[rows, plan.motion], float(np.median(self.sd[rows, plan.motion]))
+        readings = self.measured[rows, plan.motion]
+        sd = float(np.median(self.sd[rows, plan.motion]))
         if plan.angle:
             lag = slope_rows(time, readings, sd)[0] // 2
             time_difference = time[lag:] - time[:-lag]
@@ -374,8 +382,10 @@ class _LogArrays:
 
     def length(self) -> float:
         """Length of a window [s], from the bandwidth of the motion."""
-        lasting = [correlation_time(*self.motion(rows)) for rows in self.each if len(rows) > 2 * FEWEST]
-        return max(CORRELATED * float(np.median(lasting)) if lasting else 0.0, LONG * self.step)
+        correlation_times = [
+            correlation_time(*self.motion(rows)) for rows in self.rows_of_runs if len(rows) > 2 * FEWEST
+        ]
+        return max(CORRELATED * float(np.median(correlation_times)) if correlation_times else 0.0, LONG * self.step)
 
     def points(self, run: int, size: int, delay: float | None) -> Columns:
         """Averages over groups of `size` consecutive rows of a run, within segments without a gap or a jump.
@@ -384,39 +394,41 @@ class _LogArrays:
             delay: delay of the jumps [s]. None: segments may contain jumps.
 
         Returns:
-            By name: row, time, shown, sd and cell as in `LogPoints`, and the segment of each point, -1 for points in
-                no window.
+            By name: row, time, readings, sd and cell as in `LogPoints`. Also the segment of each point, -1 for
+                points in no window.
         """
-        rows = self.each[run]
+        rows = self.rows_of_runs[run]
         times = self.time[rows]
-        broken = np.r_[False, np.diff(times) > GAP * self.step][: len(rows)]
+        begins_segment = np.r_[False, np.diff(times) > GAP * self.step][: len(rows)]
         # A reading at the instant of a jump still shows the state before it, as does the first of a run.
         jumps = np.zeros(0) if delay is None else _jump_times(self.observe, run) + delay
-        after = np.searchsorted(times, np.r_[times[:1], jumps] + 1e-9)
-        if len(after) * FEWEST < len(rows):  # else a quantity that always jumps is one that changes smoothly
-            broken[after[after < len(rows)]] = True
-        stretch = np.cumsum(broken)
-        begin = np.flatnonzero(np.r_[True, np.diff(stretch) != 0])[: len(rows)]
-        place = np.arange(len(rows)) - begin[stretch] if len(rows) else stretch
-        block = np.cumsum((place % size == 0) | broken) - 1
+        rows_after_jumps = np.searchsorted(times, np.r_[times[:1], jumps] + 1e-9)
+        if len(rows_after_jumps) * FEWEST < len(
+            rows
+        ):  # else a quantity that always jumps is one that changes smoothly
+            begins_segment[rows_after_jumps[rows_after_jumps < len(rows)]] = True
+        segment = np.cumsum(begins_segment)
+        segment_starts = np.flatnonzero(np.r_[True, np.diff(segment) != 0])[: len(rows)]
+        position = np.arange(len(rows)) - segment_starts[segment] if len(rows) else segment
+        block = np.cumsum((position % size == 0) | begins_segment) - 1
         first_row, count = np.unique(block, return_index=True, return_counts=True)[1:]
 
         def mean(x: np.ndarray) -> np.ndarray:
             return np.add.reduceat(x, first_row, axis=0) / (count if x.ndim == 1 else count[:, None])
 
         middle = 0.5 * (times[1:] + times[:-1])
-        inner = ~broken[1:]
-        low = np.r_[times[:1], np.where(inner, middle, times[1:])]
-        high = np.r_[np.where(inner, middle, times[:-1]), times[-1:]]
+        is_within_segment = ~begins_segment[1:]
+        low = np.r_[times[:1], np.where(is_within_segment, middle, times[1:])]
+        high = np.r_[np.where(is_within_segment, middle, times[:-1]), times[-1:]]
         last_row = first_row + count - 1
         cell = np.stack([low[first_row] - EDGE * self.step, high[last_row] + EDGE * self.step], 1)
         return {
             "row": rows[first_row + count // 2],
             "time": mean(times),
-            "shown": mean(self.measured[rows]),
+            "readings": mean(self.measured[rows]),
             "sd": np.sqrt(mean(self.sd[rows] ** 2) / count[:, None]),
             "cell": cell,
-            "stretch": np.where(count == size, stretch[first_row], -1),
+            "segment": np.where(count == size, segment[first_row], -1),
         }
 
     def course(self, cells: list[np.ndarray]) -> ImposedCourse:
@@ -429,23 +441,25 @@ class _LogArrays:
             if np.ptp(x) > 0
         }
         linear = self.problem.base.rig.between_rows == "linear"
-        knots, drive_changes = list[np.ndarray](), list[np.ndarray]()
+        knots, shifted_cells = list[np.ndarray](), list[np.ndarray]()
         values, integrals = ({name: list[np.ndarray]() for name in changing} for _ in range(2))
         for run, (times, cell) in enumerate(zip(times_of_runs, cells, strict=True)):
             instants = np.flatnonzero(np.diff(times, prepend=-1.0) > 0)
             times, period = times[instants], times[-1] + 1.0
             time = np.r_[-period, times, times[-1] + period]
-            begin = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
+            time_shift = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
             for name, x in changing.items():
                 padded = x[run, instants[np.r_[0, 0 : len(instants), -1]]]
-                lines = linear or name in ("motor_speed", "motor_acceleration")
-                mean = 0.5 * (padded[1:] + padded[:-1]) if lines else padded[:-1]
+                is_linear = linear or name in ("motor_speed", "motor_acceleration")
+                mean = 0.5 * (padded[1:] + padded[:-1]) if is_linear else padded[:-1]
                 integrals[name].append(np.r_[0.0, np.cumsum(np.diff(time) * mean)])
                 values[name].append(padded)
-            knots.append(time + begin)
-            drive_changes.append(cell + begin)
-        means, summed = ({n: np.concatenate(x) for n, x in each.items()} for each in (values, integrals))
-        return ImposedCourse(np.concatenate(knots), means, summed, np.concatenate(drive_changes))
+            knots.append(time + time_shift)
+            shifted_cells.append(cell + time_shift)
+        joined_values, joined_integrals = (
+            {n: np.concatenate(x) for n, x in arrays.items()} for arrays in (values, integrals)
+        )
+        return ImposedCourse(np.concatenate(knots), joined_values, joined_integrals, np.concatenate(shifted_cells))
 
 
 def points_and_windows(
@@ -460,56 +474,60 @@ def points_and_windows(
     log = _LogArrays(problem, plan)
     length = log.length()
     size = max(1, int(length / (POINTS * log.step)))
-    parts = [log.points(run, size, None if across else delay) for run in range(len(log.each))]
+    parts = [log.points(run, size, None if across else delay) for run in range(len(log.rows_of_runs))]
     count = np.cumsum([0, *(len(p["time"]) for p in parts)])
     joined = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     run = np.repeat(np.arange(len(parts)), np.diff(count))
-    course = log.course([p["cell"] for p in parts])
-    mean, drift = course.at(delay)
+    imposed_course = log.course([p["cell"] for p in parts])
+    mean_imposed, drift = imposed_course.at(delay)
     conditions: Any = jax.tree.map(lambda x: np.asarray(x)[joined["row"]], log.of_rows)
-    for name, x in mean.items():
+    for name, x in mean_imposed.items():
         conditions = with_condition(conditions, name, x)
-    time, readings, sd = joined["time"], joined["shown"], joined["sd"]
+    time, readings, sd = joined["time"], joined["readings"], joined["sd"]
     time_steps = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
     # Points of different runs or on both sides of a jump are apart for slopes, and those of both ways for windows.
-    stretch_index = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
-    wide, noise, rate = FEWEST, 0.0, np.zeros(len(run))
+    slope_segment = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["segment"]) != 0)])
+    slope_row_count = FEWEST
+    rate_sd = 0.0
+    rate = np.zeros(len(run))
     if plan.angle:
-        longest = max(log.each, key=len)
-        angle, sds = (x[longest, plan.motion] for x in (log.measured, log.sd))
-        wide, noise = slope_rows(log.time[longest], angle, float(np.median(sds)))
-        wide = max(FEWEST, wide // size | 1)
-        rate = local_slopes(time, readings[:, plan.motion], stretch_index, wide)
-    way, speed = _travel_directions(problem, plan, conditions, readings, sd, rate, noise)
-    usable = (way != 0) & (joined["stretch"] >= 0)
-    piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(stretch_index) != 0) | (np.diff(way) != 0)]), -1)
+        longest_run = max(log.rows_of_runs, key=len)
+        angle, sds = (x[longest_run, plan.motion] for x in (log.measured, log.sd))
+        slope_row_count, rate_sd = slope_rows(log.time[longest_run], angle, float(np.median(sds)))
+        slope_row_count = max(FEWEST, slope_row_count // size | 1)
+        rate = local_slopes(time, readings[:, plan.motion], slope_segment, slope_row_count)
+    way, speed = _travel_directions(problem, plan, conditions, readings, sd, rate, rate_sd)
+    is_usable = (way != 0) & (joined["segment"] >= 0)
+    window_segment = np.where(
+        is_usable, np.cumsum(np.r_[False, (np.diff(slope_segment) != 0) | (np.diff(way) != 0)]), -1
+    )
     if plan.angle:
-        rate = local_slopes(time, readings[:, plan.motion], piece, wide)
+        rate = local_slopes(time, readings[:, plan.motion], window_segment, slope_row_count)
     turned_angle = np.cumsum(np.where(time_steps > 0, 0.5 * (speed + np.roll(speed, 1)) * time_steps, 0.0))
     zeros = np.zeros(len(run))
     arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], time_steps, time, joined["row"]
-    late = zeros + delay, zeros + REACH * log.step, drift
+    delay_fields = zeros + delay, zeros + REACH * log.step, drift
     windows = [
-        _weight_windows(r, time, windows_of_run(time, np.where(run == r, piece, -1), length))
+        _weight_windows(r, time, windows_of_run(time, np.where(run == r, window_segment, -1), length))
         for r in range(len(parts))
     ]
-    rows = LogPoints(*jax.tree.map(jnp.asarray, (conditions, *arrays, *late)))
-    return rows, course, [w for w in windows if len(w.rows)]
+    rows = LogPoints(*jax.tree.map(jnp.asarray, (conditions, *arrays, *delay_fields)))
+    return rows, imposed_course, [w for w in windows if len(w.rows)]
 
 
 def _weight_windows(run: int, time: np.ndarray, windows: list[tuple[np.ndarray, np.ndarray]]) -> RunWindows:
     """Windows of a run with their weights at the points."""
     longest = max((len(rows) for rows, _ in windows), default=0)
-    index, values = np.zeros((len(windows), longest), int), np.zeros((4, len(windows), longest))
+    rows_of_windows, values = np.zeros((len(windows), longest), int), np.zeros((4, len(windows), longest))
     values[3] = 1.0
     for k, (rows, share) in enumerate(windows):
-        index[k], n = rows[-1], len(rows)
+        rows_of_windows[k], count = rows[-1], len(rows)
         length = (time[rows[-1]] - time[rows[0]]) / max(share[-1] - share[0], 1e-12)
-        index[k, :n] = rows
-        values[3, k, :n] = np.gradient(time[rows])
-        weights = np.array(window_function(share, length)) * values[3, k, :n]
-        values[:3, k, :n] = _exact_weights(weights, share, length)
-    return RunWindows(run, index, *values)
+        rows_of_windows[k, :count] = rows
+        values[3, k, :count] = np.gradient(time[rows])
+        weights = np.array(window_function(share, length)) * values[3, k, :count]
+        values[:3, k, :count] = _exact_weights(weights, share, length)
+    return RunWindows(run, rows_of_windows, *values)
 
 
 def _exact_weights(weights: np.ndarray, share: np.ndarray, length: float) -> np.ndarray:
@@ -518,19 +536,22 @@ def _exact_weights(weights: np.ndarray, share: np.ndarray, length: float) -> np.
 
     Plain sums over rows at irregular times are not exact. For an angle far from 0, the sum would be mostly error.
     """
-    w, powers, scaled_place = weights[0], np.arange(4), 2 * share[:, None] - 1
+    w = weights[0]
+    powers = np.arange(4)
+    scaled_place = 2 * share[:, None] - 1
     basis = scaled_place**powers
     normal = np.linalg.pinv(basis.T @ (w[:, None] * basis))
     moments = w @ basis
-    once = np.r_[0.0, powers[1:] * moments[:3]] * (2 / length)
-    twice = np.r_[0.0, 0.0, (powers[1:] * powers[:-1])[1:] * moments[:2]] * (2 / length) ** 2
-    change = [-once - weights[1] @ basis, twice - weights[2] @ basis]
-    return np.stack([w, *(x + w * (basis @ (normal @ c)) for x, c in zip(weights[1:], change, strict=True))])
+    first_moments = np.r_[0.0, powers[1:] * moments[:3]] * (2 / length)
+    second_moments = np.r_[0.0, 0.0, (powers[1:] * powers[:-1])[1:] * moments[:2]] * (2 / length) ** 2
+    errors = [-first_moments - weights[1] @ basis, second_moments - weights[2] @ basis]
+    return np.stack([w, *(x + w * (basis @ (normal @ c)) for x, c in zip(weights[1:], errors, strict=True))])
 
 
 def _jump_times(observe: Any, run: int) -> np.ndarray:
     """Times of the jumps of a run's imposed quantities [s]."""
-    conditions, times = observe.conditions, np.asarray(observe.times[run])
+    conditions = observe.conditions
+    times = np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
     imposed = "voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"
     for name in imposed:
@@ -550,28 +571,30 @@ def _travel_directions(
     problem: Problem,
     plan: StatePlan,
     conditions: Any,
-    shown: np.ndarray,
+    readings: np.ndarray,
     sd: np.ndarray,
     rate: np.ndarray,
-    noise: float,
+    rate_sd: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Direction of travel at each point, 0 if the robot may be at rest, and the speed of the output [rad/s].
 
     Args:
-        noise: standard deviation of `rate`.
+        rate_sd: standard deviation of `rate`.
     """
     if plan.imposed == "motor_speed":
-        speed, offset = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
+        speed = conditions.motor_speed / float(problem.base.gearbox.ratio)
+        speed_sd = np.zeros(len(readings))
     else:
-        robot, zero = problem.base, jnp.zeros(())
+        robot = problem.base
+        zero = jnp.zeros(())
         chassis = robot.configurations.members[0]
         rolling = State(zero, robot.gearbox.ratio, chassis.radius, zero, distance=chassis.radius)
-        per = 1 / float(
+        speed_per_reading = 1 / float(
             problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling))
         )
-        speed = per * (rate if plan.angle else shown[:, plan.motion])
-        offset = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
-    limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * offset)
+        speed = speed_per_reading * (rate if plan.angle else readings[:, plan.motion])
+        speed_sd = abs(speed_per_reading) * (np.full(len(readings), rate_sd) if plan.angle else sd[:, plan.motion])
+    limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * speed_sd)
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0), speed
 
 

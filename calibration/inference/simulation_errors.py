@@ -74,7 +74,7 @@ def r_squared(measured: np.ndarray, approximated: np.ndarray) -> float:
 
 
 def channel_errors(
-    shown: Sequence[Channel],
+    channels: Sequence[Channel],
     simulated: np.ndarray,
     measured: np.ndarray,
     sd: np.ndarray,
@@ -84,7 +84,7 @@ def channel_errors(
     unit.
 
     Args:
-        shown: the channels.
+        channels: the channels.
         simulated, measured, sd: readings and standard deviations [SI], NaN if missing, shape (rows, channels).
         percent: percentage errors of the same shape. None: `sized_error`.
     """
@@ -96,5 +96,5 @@ def channel_errors(
             "rms_sigma": root_mean_square(errors[:, k] / sd[:, k]),
             "rms": root_mean_square(errors[:, k]) / channel.factor,
         }
-        for k, channel in enumerate(shown)
+        for k, channel in enumerate(channels)
     }

@@ -102,15 +102,17 @@ class EquationTerms(eqx.Module):
 def _solve_current(robot: Robot, conditions: Conditions, state: State, way: Scalar) -> Scalar:
     """Current that satisfies the voltage balance, by Newton's method. Its derivatives are those of the last step."""
 
-    def left(robot: Robot, state: State, current: Scalar) -> Scalar:
-        state_there = dataclasses.replace(state, current=current)
-        return jnp.asarray(balances.driven_signals(robot, conditions, state_there, way).voltage_left)
+    def voltage_left(robot: Robot, state: State, current: Scalar) -> Scalar:
+        state_with_current = dataclasses.replace(state, current=current)
+        return jnp.asarray(balances.driven_signals(robot, conditions, state_with_current, way).voltage_left)
 
-    fixed: Any = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, (robot, state))
+    constants: Any = jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, (robot, state)
+    )
     current = jnp.zeros(())
     for step in range(CURRENT_STEPS):
-        value, slope = jax.jvp(lambda x: left(fixed[0], fixed[1], x), (current,), (jnp.ones(()),))
-        value = left(robot, state, current) if step == CURRENT_STEPS - 1 else value
+        value, slope = jax.jvp(lambda x: voltage_left(constants[0], constants[1], x), (current,), (jnp.ones(()),))
+        value = voltage_left(robot, state, current) if step == CURRENT_STEPS - 1 else value
         current = current - value / slope
     return current
 
@@ -119,18 +121,18 @@ class _MeasuredStates(eqx.Module):
     """States that follow from the readings of one point.
 
     Attributes:
-        turning: motor speed [rad/s] and current [A].
+        motor_speed: motor speed [rad/s] and current [A].
         lead: the part of the current by which it is later than its reading, see `_current_lead` [A].
-        unit: reading of the motion channel per motor speed.
-        per_ampere: reading of the current channel per ampere.
+        reading_per_speed: reading of the motion channel per motor speed.
+        reading_per_ampere: reading of the current channel per ampere.
         errors: errors of the instruments, by channel.
     """
 
-    turning: Scalar
+    motor_speed: Scalar
     current: Scalar
     lead: Scalar
-    unit: Scalar
-    per_ampere: Scalar
+    reading_per_speed: Scalar
+    reading_per_ampere: Scalar
     errors: dict[int, Scalar]
 
 
@@ -143,91 +145,97 @@ def _current_lead(robot: Robot, row: LogPoints) -> Scalar:
     if "voltage" not in row.drift or robot.rig.between_rows == "linear":
         return jnp.zeros(())
     step, ratio = row.reach / REACH, robot.motor.inductance / robot.motor.resistance
-    rise = jnp.maximum(ratio / step, 1e-6)
-    share = 0.5 - rise - 1 / jnp.expm1(-1 / rise) - 1
+    relative_rise_time = jnp.maximum(ratio / step, 1e-6)
+    share = 0.5 - relative_rise_time - 1 / jnp.expm1(-1 / relative_rise_time) - 1
     return -share * step * row.drift["voltage"] / robot.motor.resistance
 
 
-def _measured_states(plan: StatePlan, robot: Robot, row: LogPoints, shown: Array) -> _MeasuredStates:
+def _measured_states(plan: StatePlan, robot: Robot, row: LogPoints, readings: Array) -> _MeasuredStates:
     """States that follow from the readings of one point, without slip."""
-    conditions, names = row.imposed(robot.rig.delay), channels.channel_names(robot.channels)
+    conditions = row.imposed(robot.rig.delay)
+    names = channels.channel_names(robot.channels)
     chassis = robot.chassis(conditions.configuration)
-    none, one = jnp.zeros(()), jnp.ones(())
+    zero = jnp.zeros(())
+    one = jnp.ones(())
 
-    def per_unit(k: int, state: State) -> Scalar:
+    def reading_of(k: int, state: State) -> Scalar:
         return channels.find_channel(names[k]).read(robot, balances.begin_signals(robot, conditions, state))
 
-    current: Scalar = none
-    turning: Scalar = none
-    unit: Scalar = one
-    per_ampere: Scalar = one
-    lead: Scalar = none
+    current: Scalar = zero
+    motor_speed: Scalar = zero
+    reading_per_speed: Scalar = one
+    reading_per_ampere: Scalar = one
+    lead: Scalar = zero
     if conditions.motor_current is not None:
         current = jnp.asarray(conditions.motor_current)
     if plan.current >= 0:
-        per_ampere = per_unit(plan.current, State(one, none, none, none, distance=none))
+        reading_per_ampere = reading_of(plan.current, State(one, zero, zero, zero, distance=zero))
         lead = _current_lead(robot, row)
-        current = shown[plan.current] / per_ampere + lead
+        current = readings[plan.current] / reading_per_ampere + lead
     if plan.imposed == "motor_speed":
-        turning = jnp.asarray(conditions.motor_speed)
+        motor_speed = jnp.asarray(conditions.motor_speed)
     else:
-        rolling = State(none, one, chassis.radius / robot.gearbox.ratio, none, distance=chassis.radius)
-        unit = per_unit(plan.motion, rolling)
+        rolling = State(zero, one, chassis.radius / robot.gearbox.ratio, zero, distance=chassis.radius)
+        reading_per_speed = reading_of(plan.motion, rolling)
         if plan.angle:
-            unit = unit / robot.gearbox.ratio  # that of the output by the output's
-        turning = (row.rate if plan.angle else shown[plan.motion]) / unit
-    rolls = chassis.radius * turning / robot.gearbox.ratio
-    states = State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
-    first = balances.begin_signals(robot, conditions, states)
+            reading_per_speed = reading_per_speed / robot.gearbox.ratio  # that of the output by the output's
+        motor_speed = (row.rate if plan.angle else readings[plan.motion]) / reading_per_speed
+    rolling_speed = chassis.radius * motor_speed / robot.gearbox.ratio
+    states = State(current, motor_speed, rolling_speed, zero, row.memory, distance=chassis.radius * row.angle)
+    signals = balances.begin_signals(robot, conditions, states)
     errors = {
-        k: balances.effects_sum(robot, first, "sensor", names[k]) for k in (plan.motion, plan.current) if k >= 0
+        k: balances.effects_sum(robot, signals, "sensor", names[k]) for k in (plan.motion, plan.current) if k >= 0
     }
     if plan.current >= 0:
-        current = current - errors[plan.current] / per_ampere
+        current = current - errors[plan.current] / reading_per_ampere
     if plan.motion >= 0 and not plan.angle:
-        turning = turning - errors[plan.motion] / unit
-    return _MeasuredStates(turning, current, lead, unit, per_ampere, errors)
+        motor_speed = motor_speed - errors[plan.motion] / reading_per_speed
+    return _MeasuredStates(motor_speed, current, lead, reading_per_speed, reading_per_ampere, errors)
 
 
 def _rolling_signals(
-    plan: StatePlan, robot: Robot, row: LogPoints, turning: Scalar, current: Scalar
+    plan: StatePlan, robot: Robot, row: LogPoints, motor_speed: Scalar, current: Scalar
 ) -> tuple[Signals, Scalar]:
     """Signals of a point with these states, and its current. If no channel shows the current, it follows from the
     equations.
     """
     conditions = row.imposed(robot.rig.delay)
     radius = robot.chassis(conditions.configuration).radius
-    rolls, distance = radius * turning / robot.gearbox.ratio, radius * row.angle
-    state = State(current, turning, rolls, jnp.zeros(()), row.memory, distance=distance)
+    rolling_speed, distance = radius * motor_speed / robot.gearbox.ratio, radius * row.angle
+    state = State(current, motor_speed, rolling_speed, jnp.zeros(()), row.memory, distance=distance)
     if plan.imposed == "voltage" and plan.current < 0:
         current = _solve_current(robot, conditions, state, row.way)
     return balances.rolling_signals(robot, conditions, dataclasses.replace(state, current=current), row.way), current
 
 
 def equation_terms(
-    plan: StatePlan, robot: Robot, row: LogPoints, shown: Array, probes: frozenset[str] = frozenset()
+    plan: StatePlan, robot: Robot, row: LogPoints, readings: Array, probes: frozenset[str] = frozenset()
 ) -> tuple[Array, Array, Signals]:
     """Terms f and y of the equations at one point, and its signals.
 
     Args:
         row: one point of `LogPoints`, without the first axis.
-        shown: its readings [SI], shape (channels,).
+        readings: its readings [SI], shape (channels,).
         probes: names of effects that read no signal.
     """
-    names, chassis = channels.channel_names(robot.channels), robot.chassis(row.conditions.configuration)
-    states, none = _measured_states(plan, robot, row, shown), jnp.zeros(())
-    turning = states.turning
+    names = channels.channel_names(robot.channels)
+    chassis = robot.chassis(row.conditions.configuration)
+    states = _measured_states(plan, robot, row, readings)
+    zero = jnp.zeros(())
+    motor_speed = states.motor_speed
     if robot.has_ground and plan.mechanical and plan.travels:
         # The wheels turn faster than the load travels because of slip.
-        first = balances.begin_signals(
+        rolling = balances.begin_signals(
             robot, row.conditions,
-            State(states.current, turning, chassis.radius * turning / robot.gearbox.ratio, none, row.memory,
+            State(states.current, motor_speed, chassis.radius * motor_speed / robot.gearbox.ratio, zero, row.memory,
                   distance=chassis.radius * row.angle),
         )  # fmt: skip
         if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
-            first = _rolling_signals(plan, robot, row, turning, states.current)[0]
-        turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
-    signals, current = _rolling_signals(plan, robot, row, turning, states.current)
+            rolling = _rolling_signals(plan, robot, row, motor_speed, states.current)[0]
+        motor_speed = (
+            motor_speed + balances.effects_sum(robot, rolling, "slip") * robot.gearbox.ratio / chassis.radius
+        )
+    signals, current = _rolling_signals(plan, robot, row, motor_speed, states.current)
     f, y = list[Any](), list[Any]()
     if plan.electrical:
         # Divided by the inductance, the rate of the current would be mostly noise, and a large inductance fit best.
@@ -236,20 +244,25 @@ def equation_terms(
     if plan.mechanical:
         # A torque, not an acceleration: the derivative by an inertia is then the motion, which states without noise
         # give. That of an acceleration is a torque, whose model error would enter its own instrument.
-        carried = chassis.radius**2 * signals.mass / robot.sides if robot.has_ground else 0.0
-        gear, turns = robot.gearbox, chassis.inertia + signals.inertia_added + carried
-        inertia = inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, turns)
-        read = (shown[plan.motion] - states.errors[plan.motion]) / states.unit if plan.angle else turning
+        load_inertia = chassis.radius**2 * signals.mass / robot.sides if robot.has_ground else 0.0
+        gearbox = robot.gearbox
+        output_inertia = chassis.inertia + signals.inertia_added + load_inertia
+        inertia = inertia_reduced(robot.motor.inertia, gearbox.ratio, gearbox.efficiency_load, output_inertia)
+        motion = (
+            (readings[plan.motion] - states.errors[plan.motion]) / states.reading_per_speed
+            if plan.angle
+            else motor_speed
+        )
         f.append(inertia * signals.acceleration_wheel)
-        y.append(inertia * read / robot.gearbox.ratio)
+        y.append(inertia * motion / robot.gearbox.ratio)
     if plan.others:
         if robot.has_ground:
             creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)
             slip_effects = balances.effects_sum(robot, signals, "slip")
             signals = dataclasses.replace(signals, speed=signals.speed_theoretical - creep - slip_effects)
-        says = balances.sensor(robot, signals)
-        f += [says[names[k]] - shown[k] for k in plan.others]
-        y += [none] * len(plan.others)
+        sensor_readings = balances.sensor(robot, signals)
+        f += [sensor_readings[names[k]] - readings[k] for k in plan.others]
+        y += [zero] * len(plan.others)
     return jnp.stack([jnp.asarray(x, float) for x in f]), jnp.stack([jnp.asarray(x, float) for x in y]), signals
 
 
@@ -264,11 +277,12 @@ def with_smooth_states(problem: Problem, plan: StatePlan, rows: LogPoints, z: Ar
     if not plan.mechanical:
         return rows
     robot = problem.coordinates.robot(problem.base, z)
-    units = jax.vmap(lambda row: _measured_states(plan, robot, row, row.shown))(rows)
-    read, count = jnp.stack([units.turning, units.current], 1), 1 + plan.electrical
+    measured_states = jax.vmap(lambda row: _measured_states(plan, robot, row, row.readings))(rows)
+    state_readings = jnp.stack([measured_states.motor_speed, measured_states.current], 1)
+    count = 1 + plan.electrical
 
-    def step(before: tuple[Array, Array], given: tuple[LogPoints, Array]) -> tuple[tuple[Array, Array], Array]:
-        (x, idle), (row, reading) = before, given
+    def step(carry: tuple[Array, Array], inputs: tuple[LogPoints, Array]) -> tuple[tuple[Array, Array], Array]:
+        (x, idle), (row, reading) = carry, inputs
 
         def rates(x: Array) -> tuple[Array, tuple[Array, Signals]]:
             signals = _rolling_signals(plan, robot, row, x[0], jnp.append(x, reading[count:])[1])[0]
@@ -284,15 +298,18 @@ def with_smooth_states(problem: Problem, plan: StatePlan, rows: LogPoints, z: Ar
         x = jnp.where(rests | idle | ~jnp.all(jnp.isfinite(x)), reading[:count], x)
         return (x, rests), x
 
-    states = jax.lax.scan(step, (read[0, :count], jnp.asarray(True)), (rows, read))[1]
-    readings, rate = rows.shown, rows.rate
+    states = jax.lax.scan(step, (state_readings[0, :count], jnp.asarray(True)), (rows, state_readings))[1]
+    readings, rate = rows.readings, rows.rate
     if plan.electrical:
-        readings = readings.at[:, plan.current].set((states[:, 1] - units.lead) * units.per_ampere)
-    motion = states[:, 0] * units.unit
+        readings = readings.at[:, plan.current].set(
+            (states[:, 1] - measured_states.lead) * measured_states.reading_per_ampere
+        )
+    motion = states[:, 0] * measured_states.reading_per_speed
     if plan.angle:
-        rate, motion = motion, jnp.cumsum(0.5 * (motion + jnp.roll(motion, 1)) * rows.since)
+        rate = motion
+        motion = jnp.cumsum(0.5 * (motion + jnp.roll(motion, 1)) * rows.since)
     readings = readings.at[:, plan.motion].set(motion)
-    return dataclasses.replace(rows, shown=readings, rate=rate)
+    return dataclasses.replace(rows, readings=readings, rate=rate)
 
 
 @functools.partial(compiling.compiled, options=compiling.SELDOM)
@@ -302,14 +319,15 @@ def _terms_with_derivatives(
     """Terms at each point for coordinates z, with derivatives with respect to base parameters, readings and
     effects.
     """
-    entering = tuple(
+    balances_changed = tuple(
         dict.fromkeys((*linearization.PROBED, *(e.effect.balance for e in effects if e.effect.balance != "sensor")))
     )
-    probes = tuple(linearization.balance_probe(b) for b in entering)
-    size, names = z.size, channels.channel_names(problem.channels)
+    probes = tuple(linearization.balance_probe(b) for b in balances_changed)
+    size = z.size
+    names = channels.channel_names(problem.channels)
 
     def terms_of_point(row: LogPoints) -> tuple[Any, tuple[Any, Signals]]:
-        def both(x: Array) -> tuple[Any, tuple[Any, Signals]]:
+        def terms_and_values(x: Array) -> tuple[Any, tuple[Any, Signals]]:
             base = problem.coordinates.robot(problem.base, x[:size])
             robot = linearization.with_probes(base, probes, x[size : size + len(probes)])
             f, y, signals = equation_terms(
@@ -317,29 +335,35 @@ def _terms_with_derivatives(
             )
             return (f, y), ((f, y), signals)
 
-        return jax.jacfwd(both, has_aux=True)(jnp.concatenate([z, jnp.zeros(len(probes)), row.shown]))
+        return jax.jacfwd(terms_and_values, has_aux=True)(jnp.concatenate([z, jnp.zeros(len(probes)), row.readings]))
 
     slopes, (values, signals) = jax.vmap(terms_of_point)(rows)
     base = problem.coordinates.robot(problem.base, z)
     memory = memory_by_point(base, rows, signals, effects)
     angle = rows.angle
     if plan.angle:  # The integrated readings have noise, which a gain of them would explain.
-        units = jax.vmap(lambda row: _measured_states(plan, base, row, row.shown).unit)(rows)
-        angle = rows.shown[:, plan.motion] / (units * base.gearbox.ratio)
+        readings_per_speed = jax.vmap(lambda row: _measured_states(plan, base, row, row.readings).reading_per_speed)(
+            rows
+        )
+        angle = rows.readings[:, plan.motion] / (readings_per_speed * base.gearbox.ratio)
 
-    def entering_terms(signals: Signals, angle: Array, memory: list[Array]) -> Array:
-        read = dataclasses.replace(signals, angle=angle)
+    def terms_of_effects(signals: Signals, angle: Array, memory: list[Array]) -> Array:
+        signals_with_angle = dataclasses.replace(signals, angle=angle)
         terms = [
-            linearization.effect_terms(base, read if e.effect.balance == "sensor" else signals, (e,), [m])
+            linearization.effect_terms(
+                base, signals_with_angle if e.effect.balance == "sensor" else signals, (e,), [m]
+            )
             for e, m in zip(effects, memory, strict=True)
         ]
         return jnp.concatenate([jnp.zeros(0), *terms])
 
-    entered = jax.vmap(entering_terms)(signals, angle, memory)
+    effect_values = jax.vmap(terms_of_effects)(signals, angle, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
     instances = [e.effect for e in effects for _ in e.at]
-    enters = np.array([size + entering.index(e.balance) if e.balance in entering else -1 for e in instances], int)
+    tangent_of_effect = np.array(
+        [size + balances_changed.index(e.balance) if e.balance in balances_changed else -1 for e in instances], int
+    )
     channel_of = np.array([names.index(e.channel) if e.channel in names else 0 for e in instances], int)
     first = len(values[0][0]) - len(plan.others)
 
@@ -347,18 +371,21 @@ def _terms_with_derivatives(
         change = -slope[:, :, size + len(probes) :][:, :, channel_of]
         for k, channel in enumerate(plan.others):
             change = change.at[:, first + k].set(jnp.asarray(1.0 * (channel_of == channel)) * direct)
-        return jnp.where(enters >= 0, slope[:, :, np.maximum(enters, 0)], change) * entered[:, None]
+        return (
+            jnp.where(tangent_of_effect >= 0, slope[:, :, np.maximum(tangent_of_effect, 0)], change)
+            * effect_values[:, None]
+        )
 
-    def both(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
+    def slopes_of_f_and_y(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
         return part(slopes[0], True), part(slopes[1], False)
 
     return EquationTerms(
         values[0],
         values[1],
-        both(lambda s, _: s[:, :, :size]),
-        both(lambda s, _: s[:, :, size : size + len(linearization.PROBED)]),
-        both(lambda s, _: s[:, :, size + len(probes) :]),
-        both(of_effects),
+        slopes_of_f_and_y(lambda s, _: s[:, :, :size]),
+        slopes_of_f_and_y(lambda s, _: s[:, :, size : size + len(linearization.PROBED)]),
+        slopes_of_f_and_y(lambda s, _: s[:, :, size + len(probes) :]),
+        slopes_of_f_and_y(of_effects),
         jax.tree.map(lambda x: jnp.broadcast_to(x, rows.time.shape), signals),
     )
 
@@ -368,20 +395,22 @@ def memory_by_point(
 ) -> list[Array]:
     """Memory of each effect at each point of the log and of the effect's grid, shape (points, grid)."""
     count = rows.since.shape[0]
-    nothing = [jnp.zeros((count, len(e.at))) for e in effects]
+    no_memory = [jnp.zeros((count, len(e.at))) for e in effects]
 
     def of_effect(scored: linearization.ScoredEffect) -> Array:
-        def after(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
+        def advance(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
             since, angle, signals = row
-            speed, slope = value_and_slope(lambda m: linearization.memory_rates(robot, scored, signals, m), memory)
+            rate, slope = value_and_slope(lambda m: linearization.memory_rates(robot, scored, signals, m), memory)
             start_memory = linearization.initial_memory(robot, scored, angle)
-            memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), start_memory)
+            memory = jnp.where(since > 0, memory + since * rate / (1 - since * slope), start_memory)
             return memory, memory
 
         start_memory = linearization.initial_memory(robot, scored, rows.angle[0])
-        return jax.lax.scan(after, start_memory, (rows.since, rows.angle, signals))[1]
+        return jax.lax.scan(advance, start_memory, (rows.since, rows.angle, signals))[1]
 
-    return [zero if e.effect.memory_size is None else of_effect(e) for e, zero in zip(effects, nothing, strict=True)]
+    return [
+        zero if e.effect.memory_size is None else of_effect(e) for e, zero in zip(effects, no_memory, strict=True)
+    ]
 
 
 # --- a delay --------------------------------------------------------------------------------------------------
@@ -391,17 +420,17 @@ def memory_by_point(
 def _terms_by_coordinates(problem: Problem, plan: StatePlan, rows: LogPoints, z: Array) -> Array:
     """Terms f and y and their derivatives with respect to z, shape (2, points, equations, 1 + coordinates)."""
 
-    def one(row: LogPoints) -> Array:
-        def of(z: Array) -> tuple[Array, Array]:
+    def terms_of_point(row: LogPoints) -> Array:
+        def terms_at(z: Array) -> tuple[Array, Array]:
             state_terms = jnp.stack(
-                equation_terms(plan, problem.coordinates.robot(problem.base, z), row, row.shown)[:2]
+                equation_terms(plan, problem.coordinates.robot(problem.base, z), row, row.readings)[:2]
             )
             return state_terms, state_terms
 
-        slope, value = jax.jacfwd(of, has_aux=True)(z)
+        slope, value = jax.jacfwd(terms_at, has_aux=True)(z)
         return jnp.concatenate([value[..., None], slope], -1)
 
-    return jnp.moveaxis(jax.vmap(one)(rows), 1, 0)
+    return jnp.moveaxis(jax.vmap(terms_of_point)(rows), 1, 0)
 
 
 def fit_delay(problem: Problem, plan: StatePlan) -> float:
@@ -416,23 +445,24 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
     file_delay = float(np.max(np.asarray(problem.base.rig.delay)))
     if DELAY not in problem.coordinates.names:
         return file_delay
-    rows, course, cut = points_and_windows(problem, plan, across=True)
-    if not (cut and rows.drift):
+    rows, course, windows = points_and_windows(problem, plan, across=True)
+    if not (windows and rows.drift):
         return file_delay
     time, since = np.asarray(rows.time), np.asarray(rows.since)
     step = float(np.median(since[since > 0]))
-    apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
-    cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
-    limit = TENTH * float(np.median([time[w.rows].max() for w in cut]))
-    grid = np.linspace(-limit, limit, 2 * int(np.clip(limit / step, 8, DELAYS)) + 1)
-    w = join_windows(cut)
-    inside, places = np.unique(w.rows, return_inverse=True)
-    w = dataclasses.replace(w, rows=places.reshape(w.rows.shape))
-    rows = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[inside]), rows)
-    course = dataclasses.replace(course, cell=course.cell[inside])
+    stride = -(-sum(len(w.rows) for w in windows) // PROFILED)
+    windows = [w.part(np.arange(0, len(w.rows), stride)) for w in windows]
+    longest = TENTH * float(np.median([time[w.rows].max() for w in windows]))
+    grid = np.linspace(-longest, longest, 2 * int(np.clip(longest / step, 8, DELAYS)) + 1)
+    joined = join_windows(windows)
+    points_inside, places = np.unique(joined.rows, return_inverse=True)
+    joined = dataclasses.replace(joined, rows=places.reshape(joined.rows.shape))
+    rows = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[points_inside]), rows)
+    course = dataclasses.replace(course, cell=course.cell[points_inside])
     free = [k for k, name in enumerate(problem.coordinates.names) if name != DELAY]
-    z, centre = np.zeros(len(problem.coordinates)), np.asarray(problem.data.centre)
-    prompt = course.at(0.0)[0]
+    z = np.zeros(len(problem.coordinates))
+    centre = np.asarray(problem.data.centre)
+    undelayed = course.at(0.0)[0]
 
     def terms_with(imposed: dict[str, np.ndarray]) -> np.ndarray:
         """Terms at z with other imposed quantities, which do not depend on a delay."""
@@ -444,45 +474,54 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
 
     def profile(delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half of what -2 log L of the windows exceeds its least, and the coordinates, at each delay."""
-        fixed = terms_with(prompt)
-        change = {n: (terms_with({**prompt, n: x + np.ptp(x)}) - fixed) / np.ptp(x) for n, x in prompt.items()}
+        undelayed_terms = terms_with(undelayed)
+        terms_per_unit = {
+            n: (terms_with({**undelayed, n: x + np.ptp(x)}) - undelayed_terms) / np.ptp(x)
+            for n, x in undelayed.items()
+        }
         # In units of what is imposed, whose factor then is 1: other residuals would shrink with a larger inertia.
-        first = max(change, key=lambda n: float(np.abs(change[n][0, ..., 0]).mean() * np.ptp(prompt[n])))
-        factor = change[first][0].mean(0)  # (equations, 1 + z)
+        largest = max(
+            terms_per_unit, key=lambda n: float(np.abs(terms_per_unit[n][0, ..., 0]).mean() * np.ptp(undelayed[n]))
+        )
+        factor = terms_per_unit[largest][0].mean(0)  # (equations, 1 + z)
         acts = np.flatnonzero(np.abs(factor[:, 0]) > 0)
-        unit, growth = factor[acts, None, :1], factor[acts, None, 1:] / factor[acts, None, :1]
-        prompt_integrals = _integrate_terms(plan, w, *fixed)[acts]
-        weighted = {n: _integrate_terms(plan, w, x[0], x[1], "wk,wk...->wk...")[acts] for n, x in change.items()}
-        costs, ends = [], []
+        unit = factor[acts, None, :1]
+        relative_slopes = factor[acts, None, 1:] / factor[acts, None, :1]
+        undelayed_integrals = _integrate_terms(plan, joined, *undelayed_terms)[acts]
+        weighted = {
+            n: _integrate_terms(plan, joined, x[0], x[1], "wk,wk...->wk...")[acts] for n, x in terms_per_unit.items()
+        }
+        costs, coordinates_by_delay = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
-            integrals = prompt_integrals.copy()  # (equations, windows, 1 + z)
+            integrals = undelayed_integrals.copy()  # (equations, windows, 1 + z)
             for n, x in weighted.items():
-                integrals += np.einsum("wk,ewk...->ew...", (means[n] - prompt[n])[w.rows], x)
-            integrals[..., 1:] -= integrals[..., :1] * growth
+                integrals += np.einsum("wk,ewk...->ew...", (means[n] - undelayed[n])[joined.rows], x)
+            integrals[..., 1:] -= integrals[..., :1] * relative_slopes
             integrals /= unit
             size = np.sqrt(np.mean(integrals[..., 0] ** 2, 1))
             for _ in range(3):  # the noise of each equation is what the regression leaves
                 flat = np.concatenate(integrals / np.maximum(size, 1e-300)[:, None, None])
                 jacobian = np.concatenate([flat[:, 1:][:, free], np.eye(len(free))])
                 target = np.concatenate([flat[:, 0], (z - centre)[free]])
-                move = -np.linalg.lstsq(jacobian, target, rcond=None)[0]
-                remainder = integrals[..., 0] + integrals[..., 1:][..., free] @ move
+                correction = -np.linalg.lstsq(jacobian, target, rcond=None)[0]
+                remainder = integrals[..., 0] + integrals[..., 1:][..., free] @ correction
                 size = np.sqrt(np.mean(remainder**2, 1))
-            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * len(w.rows) * APART)
-            ends.append(z.copy())
-            ends[-1][free] += move
-        return np.array(costs) - np.min(costs), np.stack(ends)
+            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * len(joined.rows) * APART)
+            coordinates_by_delay.append(z.copy())
+            coordinates_by_delay[-1][free] += correction
+        return np.array(costs) - np.min(costs), np.stack(coordinates_by_delay)
 
     best = 0.0
     for delays in (grid, grid, None):
         delays = best + np.linspace(-step, step, 17) if delays is None else delays
-        cost, ends = profile(delays)
+        cost, coordinates_by_delay = profile(delays)
         inner = np.r_[np.inf, cost, np.inf]
-        lows = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] <= inner[2:]) & (cost < SAME)
+        is_local_minimum = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] <= inner[2:]) & (cost < SAME)
         k = int(np.argmin(np.abs(delays)))
-        k = k if cost[k] < SAME else int(np.argmin(np.where(lows, np.abs(delays), np.inf)))
-        best, z = float(delays[k]), np.clip(ends[k], -NEAR, NEAR)
+        k = k if cost[k] < SAME else int(np.argmin(np.where(is_local_minimum, np.abs(delays), np.inf)))
+        best = float(delays[k])
+        z = np.clip(coordinates_by_delay[k], -NEAR, NEAR)
     return best if abs(best) > RESOLVED * step else 0.0
 
 
@@ -499,11 +538,11 @@ class WeakFormFit:
         residual: residuals of windows, then z - centre, shape (windows + coordinates,).
         jacobian: derivatives with respect to the coordinates.
         signatures: derivatives of the windows with respect to the amplitude of each instance [prior sd].
-        plan, cut: channels that give the states, and the windows.
+        plan, windows: channels that give the states, and the windows.
         centre, origin: prior mean, and coordinates of the terms.
         rows: points with states without noise.
-        smooth: terms there.
-        read: terms f and y at the readings.
+        smooth_terms: terms there.
+        read_terms: terms f and y at the readings.
     """
 
     z: np.ndarray
@@ -511,12 +550,12 @@ class WeakFormFit:
     jacobian: np.ndarray
     signatures: np.ndarray
     plan: StatePlan
-    cut: list[RunWindows]
+    windows: list[RunWindows]
     centre: np.ndarray
     origin: np.ndarray
     rows: LogPoints
-    smooth: EquationTerms
-    read: tuple[Any, Any]
+    smooth_terms: EquationTerms
+    read_terms: tuple[Any, Any]
 
 
 def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, ...] = ()) -> WeakFormFit | None:
@@ -531,11 +570,13 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
     plan = state_plan(problem)
     if plan is None:
         return None
-    late = fit_delay(problem, plan)
-    rows, _, cut = points_and_windows(problem, plan, late)
-    cut = [w.part(k) for w in cut for k in np.array_split(np.arange(len(w.rows)), -(-len(w.rows) // TOGETHER))]
+    delay = fit_delay(problem, plan)
+    rows, _, windows = points_and_windows(problem, plan, delay)
+    windows = [
+        w.part(k) for w in windows for k in np.array_split(np.arange(len(w.rows)), -(-len(w.rows) // TOGETHER))
+    ]
     equations = plan.electrical + plan.mechanical + len(plan.others)
-    if equations * sum(len(w.rows) for w in cut) < ENOUGH * len(problem.coordinates):
+    if equations * sum(len(w.rows) for w in windows) < ENOUGH * len(problem.coordinates):
         return None
 
     sd = np.asarray(rows.sd)
@@ -543,14 +584,17 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
     def terms(rows: LogPoints, z: np.ndarray) -> EquationTerms:
         return jax.device_get(_terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects))
 
-    def whiten(factors: list[np.ndarray], *given: tuple[Any, Any]) -> np.ndarray:
-        windows = zip(factors, cut, strict=True)
-        return np.concatenate([solve_triangular(x, window_errors(plan, w, *given), lower=True) for x, w in windows])
+    def whiten(factors: list[np.ndarray], *terms_by_pair: tuple[Any, Any]) -> np.ndarray:
+        factors_and_windows = zip(factors, windows, strict=True)
+        return np.concatenate(
+            [solve_triangular(x, window_errors(plan, w, *terms_by_pair), lower=True) for x, w in factors_and_windows]
+        )
 
-    coordinates, centre = problem.coordinates, np.array(problem.data.centre)
+    coordinates = problem.coordinates
+    centre = np.array(problem.data.centre)
     if DELAY in coordinates.names:  # windows without jumps may not show it
         k = coordinates.names.index(DELAY)
-        centre[k] = (late - float(coordinates.value(centre)[k])) / float(coordinates.spread[k])
+        centre[k] = (delay - float(coordinates.value(centre)[k])) / float(coordinates.spread[k])
 
     def linearise_about(origin: np.ndarray) -> tuple[Any, ...]:
         """Function that returns residuals and their derivatives at z, and derivatives of the terms with respect to
@@ -558,23 +602,23 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
         of which are those of the origin.
         """
         smooth = with_smooth_states(problem, plan, rows, jnp.asarray(origin))
-        exact, of_readings = terms(smooth, origin), terms(rows, origin)
-        read = of_readings.f, of_readings.y  # the rest of a long log is large
-        factors = _window_factors(plan, cut, sd, exact, read)
-        offset = whiten(factors, read) - whiten(factors, (exact.f, exact.y))
-        last: dict[bytes, tuple[np.ndarray, tuple[Any, Any]]] = {}
+        smooth_terms, reading_terms = terms(smooth, origin), terms(rows, origin)
+        read_terms = reading_terms.f, reading_terms.y  # the rest of a long log is large
+        factors = _window_factors(plan, windows, sd, smooth_terms, read_terms)
+        offset = whiten(factors, read_terms) - whiten(factors, (smooth_terms.f, smooth_terms.y))
+        cache: dict[bytes, tuple[np.ndarray, tuple[Any, Any]]] = {}
 
         def at(z: np.ndarray) -> tuple[np.ndarray, tuple[Any, Any]]:
-            if (key := z.tobytes()) not in last:
-                given = terms(smooth, z)
-                errors = whiten(factors, (given.f[..., None], given.y[..., None]), given.by_z)
+            if (key := z.tobytes()) not in cache:
+                terms_at_z = terms(smooth, z)
+                errors = whiten(factors, (terms_at_z.f[..., None], terms_at_z.y[..., None]), terms_at_z.by_z)
                 errors[:, 0] += offset
                 priors = np.concatenate([(z - centre)[:, None], np.eye(len(z))], 1)
-                last.clear()
-                last[key] = np.concatenate([errors, priors]), given.by_effects
-            return last[key]
+                cache.clear()
+                cache[key] = np.concatenate([errors, priors]), terms_at_z.by_effects
+            return cache[key]
 
-        return at, factors, smooth, exact, read
+        return at, factors, smooth, smooth_terms, read_terms
 
     z = centre
     try:
@@ -594,29 +638,37 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
         signatures = whiten(factors, by_effects)
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
-    return WeakFormFit(z, residuals[:, 0], residuals[:, 1:], signatures, plan, cut, centre, origin, *states)
+    return WeakFormFit(z, residuals[:, 0], residuals[:, 1:], signatures, plan, windows, centre, origin, *states)
 
 
 def _window_factors(
-    plan: StatePlan, cut: list[RunWindows], sd: np.ndarray, exact: EquationTerms, read: tuple[Any, Any]
+    plan: StatePlan,
+    windows: list[RunWindows],
+    sd: np.ndarray,
+    smooth_terms: EquationTerms,
+    read_terms: tuple[Any, Any],
 ) -> list[np.ndarray]:
     """Cholesky factors of the covariance of each part of the windows, with the disturbances of the equations.
 
     Args:
-        exact, read: terms at states without noise, and at the readings.
+        smooth_terms, read_terms: terms at states without noise, and at the readings.
     """
-    equations = exact.f.shape[1]
-    plain = [covariance_factor(plan, w, sd, exact, np.zeros(equations)) for w in cut]
-    defect, noise, unit = (
+    equations = smooth_terms.f.shape[1]
+    reading_factors = [covariance_factor(plan, w, sd, smooth_terms, np.zeros(equations)) for w in windows]
+    defect, noise, unit_variance = (
         np.concatenate([x.reshape(equations, -1).T for x in parts])
         for parts in (
-            [window_errors(plan, w, read) for w in cut],
-            [np.sum(x**2, 1) for x in plain],
-            [np.tile(np.sum(w.weight**2 / w.steps, 1), equations) for w in cut],
+            [window_errors(plan, w, read_terms) for w in windows],
+            [np.sum(x**2, 1) for x in reading_factors],
+            [np.tile(np.sum(w.weight**2 / w.steps, 1), equations) for w in windows],
         )
     )
-    unknown = disturbance_intensities(defect, noise, unit)
-    return [covariance_factor(plan, w, sd, exact, unknown) for w in cut] if unknown.any() else plain
+    disturbances = disturbance_intensities(defect, noise, unit_variance)
+    return (
+        [covariance_factor(plan, w, sd, smooth_terms, disturbances) for w in windows]
+        if disturbances.any()
+        else reading_factors
+    )
 
 
 def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[Any, Any]) -> np.ndarray:
@@ -646,30 +698,31 @@ def derivative_weights(plan: StatePlan, w: RunWindows, equations: int) -> list[n
 
 
 def covariance_factor(
-    plan: StatePlan, w: RunWindows, sd: np.ndarray, terms: EquationTerms, unknown: np.ndarray
+    plan: StatePlan, w: RunWindows, sd: np.ndarray, terms: EquationTerms, disturbances: np.ndarray
 ) -> np.ndarray:
-    """Cholesky factor of the covariance of some windows. `unknown`: torque and voltage that the model does not
+    """Cholesky factor of the covariance of some windows. `disturbances`: torque and voltage that the model does not
     explain (`disturbance_intensities`).
     """
     equations, (points, channels) = terms.f.shape[1], sd.shape
-    reading_factors, also = terms.by_reading
+    f_factors, y_factors = terms.by_reading
     noise = []
     for k, slope in enumerate(derivative_weights(plan, w, equations)):
-        changed = w.weight[..., None] * reading_factors[w.rows, k] + slope[..., None] * also[w.rows, k]
-        own_equations = np.zeros((*w.rows.shape, equations))
-        own_equations[..., k] = unknown[k] * w.weight / np.sqrt(w.steps)
-        noise.append(np.concatenate([changed * sd[w.rows], own_equations], -1))
-    all_noise, wide = np.concatenate(noise), channels + equations
-    column = np.tile(w.rows, (equations, 1))[..., None] * wide + np.arange(wide)
+        reading_noise = w.weight[..., None] * f_factors[w.rows, k] + slope[..., None] * y_factors[w.rows, k]
+        disturbance = np.zeros((*w.rows.shape, equations))
+        disturbance[..., k] = disturbances[k] * w.weight / np.sqrt(w.steps)
+        noise.append(np.concatenate([reading_noise * sd[w.rows], disturbance], -1))
+    all_noise = np.concatenate(noise)
+    sources = channels + equations
+    column = np.tile(w.rows, (equations, 1))[..., None] * sources + np.arange(sources)
     row = np.broadcast_to(np.arange(len(all_noise))[:, None, None], all_noise.shape)
-    flat = sparse.csr_matrix(
-        (all_noise.ravel(), (row.ravel(), column.ravel())), shape=(len(all_noise), points * wide)
+    noise_by_source = sparse.csr_matrix(
+        (all_noise.ravel(), (row.ravel(), column.ravel())), shape=(len(all_noise), points * sources)
     )
-    covariance = (flat @ flat.T).toarray()
+    covariance = (noise_by_source @ noise_by_source.T).toarray()
     return np.linalg.cholesky(covariance + np.diag(FLOOR * np.maximum(np.diag(covariance), 1e-300)))
 
 
-def disturbance_intensities(defect: np.ndarray, noise: np.ndarray, unit: np.ndarray) -> np.ndarray:
+def disturbance_intensities(defect: np.ndarray, noise: np.ndarray, unit_variance: np.ndarray) -> np.ndarray:
     """Intensity of white noise in the terms of each equation, in addition to the noise of the readings.
 
     A model error is not white. But without such noise, windows weighted for a precise instrument would see only the
@@ -678,8 +731,8 @@ def disturbance_intensities(defect: np.ndarray, noise: np.ndarray, unit: np.ndar
     Args:
         defect: error of each window, shape (windows, equations).
         noise: variance of these errors due to the readings.
-        unit: variance due to white noise of intensity 1.
+        unit_variance: variance due to white noise of intensity 1.
     """
-    more = np.mean(defect**2 - noise, 0)
+    excess = np.mean(defect**2 - noise, 0)
     chance = CHANCE * np.sqrt(2 * np.sum(noise**2, 0) / APART) / len(defect)
-    return np.where(more > chance, np.sqrt(np.maximum(more, 0.0) / np.mean(unit, 0)), 0.0)
+    return np.where(excess > chance, np.sqrt(np.maximum(excess, 0.0) / np.mean(unit_variance, 0)), 0.0)

@@ -35,16 +35,16 @@ from calibration.sizing.part_options import DriveOption, PartOptions, Sheet, opt
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.robot import Robot
 
-#: Ranges of cells in series, cells in parallel, and the radius as a multiple of the robot's (on tracks the height of
-#: 100 mm of Section 2.2 allows 1.3).
+#: Ranges of cells in series, cells in parallel, and the radius as a multiple of the robot's. On tracks, the height of
+#: 100 mm of Section 2.2 allows 1.3.
 CELLS, PARALLEL, RADIUS = (3, 14), (1.0, 12.0), (0.6, 1.3)
 #: Random designs for each choice of parts.
 TRIES = 6
 #: Rows of one call of `_evaluate_designs`.
 ROWS = 8192
-#: Number of choices whose best random design is refined with three points along each axis, and number of designs that
-#: are refined after that, with any ratio and fractions of a cell. Points along each axis, rounds, and shrinkage of
-#: the box per round.
+#: Number of choices whose best random design is refined with three points along each axis. Number of designs that are
+#: refined after that, with any ratio and fractions of a cell. Points along each axis, rounds, and shrinkage of the
+#: box per round.
 COARSE, REFINED, POINTS_PER_AXIS, ROUNDS, SHRINK = 300, 24, 7, 7, 0.45
 #: Half width of the first box [ratio of each number, logarithm].
 WIDTH = 0.25

@@ -52,7 +52,7 @@ def execute(config: configuration.Compare, invocation: configuration.ComparedRun
             raise BadConfiguration(f"{option}: {Path(runs.source).name} contains time histories; remove this option")
         prepared = preparation.prepare_input(runs, file.robot)
         robot = prepared.robot
-        remarks = (*prepared.checked, *prepared.begins, *prepared.weighed)
+        remarks = (*prepared.table_remarks, *prepared.start_remarks, *prepared.mass_remarks)
         second_robot = None if second_file is None else preparation.prepare_input(runs, second_file.robot).robot
     else:
         robot = inferred_facts.with_inferred_instruments(file.robot, runs)

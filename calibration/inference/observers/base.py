@@ -1,4 +1,4 @@
-"""Interface of observers: readings of one kind of runs, and how inference treats them."""
+"""Interface of observers: readings of one kind of runs, and properties of that kind that inference needs."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Observer(eqx.Module):
             programs. Larger tables are padded to a multiple of the last one. Empty for no padding.
         blocks: kinds of block to hold out, the most informative first.
         policy: options of batched fits.
-        rows_tell: True if one row alone can reveal a missing effect.
+        one_row_reveals: True if one row alone can reveal a missing effect.
         evidence: kinds of evidence for a missing effect.
         library: effects that only such data can reveal, in addition to the library.
         menu: True if the menu of experiments has runs of this kind.
@@ -86,7 +86,7 @@ class Observer(eqx.Module):
     sizes_padded: ClassVar[tuple[int, ...]] = ()
     blocks: ClassVar[Names]
     policy: ClassVar[SearchPolicy]
-    rows_tell: ClassVar[bool]
+    one_row_reveals: ClassVar[bool]
     evidence: ClassVar[Names]
     library: ClassVar[Mapping[str, type[Effect]]] = {}
     menu: ClassVar[bool] = True
@@ -187,15 +187,17 @@ class Observer(eqx.Module):
         return None
 
     @property
-    def apart(self) -> bool:
-        """True if `solve` takes much longer to compile than `shown`, so that it is compiled as a separate program."""
+    def solves_separately(self) -> bool:
+        """True if `solve` is compiled as a separate program, because its compilation takes much longer."""
         return False
 
     def read(self, robot: Robot) -> Observation:
         """Simulated observation of a robot in each row. Only for observers with a separate program for `solve`."""
         raise NotImplementedError
 
-    def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
+    def observation_at_unknowns(
+        self, robot: Robot, unknowns: Array, is_solved: Array
+    ) -> tuple[Observation, Signals, Array]:
         """Observation of a robot in each row at given unknowns, its signals, and the residuals of its equations
         there.
 
@@ -239,11 +241,11 @@ class Observer(eqx.Module):
         """Number of runs with at least one included row."""
         return int(included.sum())
 
-    def noise_misfit(self, off: Callable[[], np.ndarray], counts: Bool[np.ndarray, "rows channels"]) -> float:
+    def noise_misfit(self, residuals: Callable[[], np.ndarray], counts: Bool[np.ndarray, "rows channels"]) -> float:
         """Expected χ² of noise alone. For settled runs it is one for each reading, because rows are independent.
 
         Args:
-            off: function that returns the whitened residuals of a fit, shape (rows, channels).
+            residuals: function that returns the whitened residuals of a fit, shape (rows, channels).
             counts: True for included readings.
         """
         return float(counts.sum())
@@ -281,20 +283,21 @@ class Observer(eqx.Module):
             linear: linearization of the fit.
             drawn: one element of `draws`.
         """
-        data, jacobian = problem.data, linear.jacobian
-        counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
-        noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
+        data = problem.data
+        jacobian = linear.jacobian
+        is_fitted = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
+        noise = is_fitted * jax.random.normal(jax.random.wrap_key_data(drawn), is_fitted.shape)
         residual = noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise)
         return dataclasses.replace(linear, residual=residual)
 
     def starts(
-        self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
+        self, problem: Problem, random: np.random.Generator, count: int, problem_of_log: Problem | None = None
     ) -> Float[np.ndarray, "starts z"]:
         """Initial coordinates for at most `count` searches of a base: the prior mean, and draws of the prior.
 
         Args:
             problem: problem without effects in its coordinates.
-            every: the same problem with all rows of a log that was thinned.
+            problem_of_log: the same problem with all rows of a log that was thinned.
         """
         size = len(problem.coordinates)
         return np.concatenate([np.zeros((1, size)), random.standard_normal((max(count, 1) - 1, size))])
@@ -341,7 +344,8 @@ class Observer(eqx.Module):
             rivals: True if all members search the same optimum, so that some may be stopped early.
             most: largest number of steps. None: that of the policy.
         """
-        evaluate, steps = parallel_evaluator(problem, weights, active), self.policy.steps if most is None else most
+        evaluate = parallel_evaluator(problem, weights, active)
+        steps = self.policy.steps if most is None else most
         return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
@@ -392,16 +396,17 @@ def parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | Non
     Args:
         weights, active: values for each member, see `Observer.search`.
     """
-    weights, made = np.asarray(weights), threading.Event()
+    weights = np.asarray(weights)
+    is_compiled = threading.Event()
 
     def evaluate_one(z: np.ndarray, member: int) -> tuple[Numbers, Numbers, Observation]:
         slots = None if active is None else np.asarray(active)[member]
         return jax.device_get(problem.observe.at(problem.with_data(weight=weights[member]), z, slots))
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-        with Threads(CORES if made.is_set() else 1) as cores:
+        with Threads(CORES if is_compiled.is_set() else 1) as cores:
             results = list(cores.map(evaluate_one, z, members))
-        made.set()  # the first call has compiled the program
+        is_compiled.set()  # the first call has compiled the program
         return jax.tree.map(lambda *x: np.stack(x), *results)
 
     return evaluate

@@ -49,7 +49,7 @@ class LinearRows(Observer):
     """
 
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=16, steps=30, searches=1, one_by_one=False)
-    rows_tell: ClassVar[bool] = False
+    one_row_reveals: ClassVar[bool] = False
 
     linear: Any = eqx.field(kw_only=True)
     origin: Float[Array, " parameters"] = eqx.field(kw_only=True)
@@ -60,7 +60,8 @@ class LinearRows(Observer):
 
     def errors(self, coordinates: Any, z: Array) -> Array:
         """Predictions minus readings at coordinates z, shape (readings,)."""
-        linear, size = self.linear, self.origin.shape[0]
+        linear = self.linear
+        size = self.origin.shape[0]
         readings = linear.readings
         errors = linear.residual[:readings] + linear.jacobian[:readings] @ (z[:size] - self.origin)
         if not hasattr(coordinates, "active"):
@@ -95,7 +96,7 @@ class LinearRows(Observer):
         return np.zeros(np.shape(status), bool)
 
     def starts(
-        self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
+        self, problem: Problem, random: np.random.Generator, count: int, problem_of_log: Problem | None = None
     ) -> np.ndarray:
         return np.asarray(self.start)[None]
 
@@ -124,15 +125,19 @@ def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEf
         effects: effects whose signatures are computed.
         width: prior sd of amplitudes, relative to those of their fields.
     """
-    data, observe, z = problem.data, problem.observe, np.asarray(z)
+    data = problem.data
+    observe = problem.observe
+    z = np.asarray(z)
     linear: Any = jax.device_get(observe.linearise(problem, jnp.asarray(z), effects))
     scale = np.asarray(data.weight / data.sd)
-    raw = jax.tree.map(jnp.asarray, linear.rescaled(np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)))
+    unwhitened = jax.tree.map(
+        jnp.asarray, linear.rescaled(np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0))
+    )
     index, grid = grid_of_effects(effects)
     simulated = observe.at_fit(problem, z)
     fields: Any = {f.name: getattr(simulated, f.name) for f in dataclasses.fields(simulated)}
     rows = LinearHistories(
-        **fields, linear=raw, origin=jnp.asarray(z), start=jnp.asarray(z), width=width,
+        **fields, linear=unwhitened, origin=jnp.asarray(z), start=jnp.asarray(z), width=width,
         effect=index, grid=grid,
     )  # fmt: skip
     return dataclasses.replace(problem, observe=rows)
@@ -142,18 +147,19 @@ def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEf
 def _evaluated(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> tuple[Array, Array, Observation]:
     """Residuals of rows, penalties and priors, their Jacobian, and the observation."""
 
-    def both(z: Array) -> tuple[Array, Array]:
+    def errors_twice(z: Array) -> tuple[Array, Array]:
         errors = observe.errors(coordinates, z)
         return errors, errors
 
-    slopes, errors = jax.jacfwd(both, has_aux=True)(z)
-    scale, penalties = (data.weight / data.sd).ravel(), jnp.zeros(len(data.weight))
-    r = jnp.concatenate([scale * errors, penalties, z - data.centre])
+    slopes, errors = jax.jacfwd(errors_twice, has_aux=True)(z)
+    scale = (data.weight / data.sd).ravel()
+    penalties = jnp.zeros(len(data.weight))
+    residual = jnp.concatenate([scale * errors, penalties, z - data.centre])
     jacobian = [scale[:, None] * slopes, jnp.zeros((len(penalties), len(z))), jnp.eye(len(z))]
     status = jnp.full(len(penalties), CONVERGED)
     reading = errors.reshape(data.weight.shape) + data.measured
     observation = Observation(reading, penalties, status, jnp.zeros_like(status))
-    return r, jnp.concatenate(jacobian), observation
+    return residual, jnp.concatenate(jacobian), observation
 
 
 # --- windows of a log ----------------------------------------------------------------------------------------
@@ -191,18 +197,19 @@ class Integrals(eqx.Module):
     def __call__(self, f: Array, y: Array) -> Float[Array, "windows channels columns"]:
         """Integrals of terms, shape (points, equations, columns), by the channel of each equation."""
         integral = functools.partial(jnp.einsum, "wl,wlc->wc")
-        plain = jnp.stack(
+        integrals = jnp.stack(
             [
                 integral(self.weight, f[self.index, k]) + integral(slope, y[self.index, k])
                 for k, slope in enumerate(self.slope)
             ]
         )
-        parts, columns = len(self.white), f.shape[-1]
-        flat = plain.reshape(len(self.slope), parts, -1, columns).swapaxes(0, 1).reshape(parts, -1, columns)
-        flat = jnp.einsum("pij,pjc->pic", self.white, flat)
-        by_window = jnp.moveaxis(flat.reshape(parts, len(self.slope), -1, columns), 1, 2)
-        out = jnp.zeros((len(self.index), self.count, columns))
-        return out.at[:, np.asarray(self.places)].set(by_window.reshape(len(self.index), -1, columns))
+        parts = len(self.white)
+        columns = f.shape[-1]
+        whitened = integrals.reshape(len(self.slope), parts, -1, columns).swapaxes(0, 1).reshape(parts, -1, columns)
+        whitened = jnp.einsum("pij,pjc->pic", self.white, whitened)
+        by_window = jnp.moveaxis(whitened.reshape(parts, len(self.slope), -1, columns), 1, 2)
+        by_channel = jnp.zeros((len(self.index), self.count, columns))
+        return by_channel.at[:, np.asarray(self.places)].set(by_window.reshape(len(self.index), -1, columns))
 
     def inside(self, windows: np.ndarray, points: int) -> np.ndarray:
         """True for points within some of the windows."""
@@ -248,7 +255,7 @@ class WindowsLinearization(Linearization):
         f, y = (s[:, :, balance, None] * shapes[:, None, :] for s in self.slopes)
         return (self.integrals(f, y) * self.scale[:, :, None]).reshape(-1, shapes.shape[1])
 
-    def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
+    def channel_columns(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         return -self.columns(len(PROBED) + channel, shapes)
 
     def variable(self, name: str) -> np.ndarray:
@@ -283,7 +290,8 @@ class Windows(LinearRows, SettledRuns):
         ways = {name: np.sign(linear.variable(name)) for name in WAYS}
         table = {bases_room.VARIABLES[v]: linear.variable(v) for v in UNSHOWN}
         table |= {name: np.asarray(x) for name, x in self.table.items()}
-        weight, scope = linear.at_points(included).astype(float), bases_room.CurveScope.of(robot, table)
+        weight = linear.at_points(included).astype(float)
+        scope = bases_room.CurveScope.of(robot, table)
         return bases_room.families_of_table(table, weight, ways, scope)
 
 
@@ -299,29 +307,36 @@ def problem_of_windows(
         columns: function that returns the table in some rows of the log.
         width: prior sd of amplitudes, relative to those of their fields.
     """
-    plan, terms, count = fit.plan, fit.smooth, len(problem.channels)
+    plan = fit.plan
+    terms = fit.smooth_terms
+    count = len(problem.channels)
     places = (*([plan.current] * plan.electrical), *([plan.motion] * plan.mechanical), *plan.others)
-    run = np.repeat([w.run for w in fit.cut], [len(w.rows) for w in fit.cut])
+    run = np.repeat([w.run for w in fit.windows], [len(w.rows) for w in fit.windows])
     run = np.pad(run, (0, -len(run) % TOGETHER), constant_values=-1)
-    windows = shown_states.join_windows(fit.cut, int(np.sum(run < 0)))
-    slope = np.stack(weak_form.derivative_weights(plan, windows, len(places)))
+    windows = shown_states.join_windows(fit.windows, int(np.sum(run < 0)))
+    slope_weights = np.stack(weak_form.derivative_weights(plan, windows, len(places)))
     parts = [windows.part(k) for k in np.split(np.arange(len(run)), len(run) // TOGETHER)]
-    sd, size = np.asarray(fit.rows.sd), len(fit.z)
-    absent = np.ones(count, bool)
-    absent[list(places)] = False
-    none = np.where((run < 0)[:, None] | absent, np.nan, 0.0)
-    data = dataclasses.replace(data_from_readings(none, np.ones_like(none), size), centre=jnp.asarray(fit.centre))
-    finite = functools.partial(np.nan_to_num, posinf=0.0, neginf=0.0)
-    reading_slopes = finite([np.concatenate(x, 2) for x in zip(terms.by_balance, terms.by_reading, strict=True)])
-    errors = [x[..., None] for x in fit.read]
+    sd = np.asarray(fit.rows.sd)
+    size = len(fit.z)
+    has_no_equation = np.ones(count, bool)
+    has_no_equation[list(places)] = False
+    zero_readings = np.where((run < 0)[:, None] | has_no_equation, np.nan, 0.0)
+    data = dataclasses.replace(
+        data_from_readings(zero_readings, np.ones_like(zero_readings), size), centre=jnp.asarray(fit.centre)
+    )
+    finite_numbers = functools.partial(np.nan_to_num, posinf=0.0, neginf=0.0)
+    reading_slopes = finite_numbers(
+        [np.concatenate(x, 2) for x in zip(terms.by_balance, terms.by_reading, strict=True)]
+    )
+    errors = [x[..., None] for x in fit.read_terms]
     plain = [jnp.asarray(np.concatenate(x, 2)) for x in zip(errors, terms.by_z, terms.by_effects, strict=True)]
 
-    def linearised(unknown: np.ndarray) -> tuple[WindowsLinearization, list[np.ndarray]]:
-        factors = [weak_form.covariance_factor(plan, w, sd, terms, unknown) for w in parts]
+    def linearised(disturbances: np.ndarray) -> tuple[WindowsLinearization, list[np.ndarray]]:
+        factors = [weak_form.covariance_factor(plan, w, sd, terms, disturbances) for w in parts]
         white = np.stack([np.linalg.inv(x) for x in factors])
         integrals = Integrals(
-            jnp.asarray(windows.rows), jnp.asarray(windows.weight), jnp.asarray(slope), jnp.asarray(white), places,
-            count,
+            jnp.asarray(windows.rows), jnp.asarray(windows.weight), jnp.asarray(slope_weights), jnp.asarray(white),
+            places, count,
         )  # fmt: skip
 
         whitened = np.asarray(_whitened(integrals, *plain)).reshape(-1, plain[0].shape[2])
@@ -329,67 +344,76 @@ def problem_of_windows(
         jacobian = np.concatenate([whitened[:, 1 : size + 1], np.zeros((len(run), size)), np.eye(size)])
         linear = WindowsLinearization(
             jnp.asarray(np.concatenate([whitened[:, 0], prior])), jnp.asarray(jacobian),
-            jnp.asarray(finite(whitened[:, size + 1 :])), jnp.zeros((len(PROBED), 0)), data.weight,
+            jnp.asarray(finite_numbers(whitened[:, size + 1 :])), jnp.zeros((len(PROBED), 0)), data.weight,
             jax.tree.map(jnp.asarray, terms.signals), integrals, jnp.asarray(reading_slopes),
             fit.rows.time, fit.rows.angle, jnp.asarray(run),
             channels=channels.channel_names(problem.channels), magnitudes=problem.base.rig.magnitudes,
         )  # fmt: skip
         return linear, factors
 
-    linear, factors = linearised(unknown := np.zeros(len(places)))
-    of_readings = factors
+    linear, factors = linearised(disturbances := np.zeros(len(places)))
+    reading_factors = factors
     for _ in range(ROUNDS):  # the intensity depends on the weights of the windows, which depend on it
-        before, unknown = unknown, _unexplained(linear, parts, factors, of_readings, size, np.asarray(data.weight))
-        if np.allclose(unknown, before, rtol=SAME):
+        previous = disturbances
+        disturbances = _unexplained(linear, parts, factors, reading_factors, size, np.asarray(data.weight))
+        if np.allclose(disturbances, previous, rtol=SAME):
             break
-        linear, factors = linearised(unknown)
+        linear, factors = linearised(disturbances)
     middle = np.take_along_axis(windows.rows, np.argmax(windows.weight, 1)[:, None], 1)[:, 0]
-    table = {name: jnp.asarray(x) for name, x in columns(np.asarray(fit.rows.first)).items()}
-    table |= {c.column: fit.rows.shown[:, k] for k, c in enumerate(problem.channels)}
+    table = {name: jnp.asarray(x) for name, x in columns(np.asarray(fit.rows.table_row)).items()}
+    table |= {c.column: fit.rows.readings[:, k] for k, c in enumerate(problem.channels)}
     index, grid = grid_of_effects(effects)
     conditions = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[middle]), fit.rows.conditions)
     observe = Windows(
         conditions, "drive", table, linear=linear, origin=jnp.asarray(fit.origin), start=jnp.asarray(fit.z),
         width=width, effect=index, grid=grid,
     )  # fmt: skip
-    return Problem(problem.base, problem.coordinates, observe, data), np.asarray(fit.rows.first)[middle]
+    return Problem(problem.base, problem.coordinates, observe, data), np.asarray(fit.rows.table_row)[middle]
 
 
 def _unexplained(
     linear: WindowsLinearization, parts: list[shown_states.RunWindows], factors: list[np.ndarray],
-    of_readings: list[np.ndarray], size: int, weight: np.ndarray,
+    reading_factors: list[np.ndarray], size: int, weight: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Intensity of the disturbance of each equation that neither the readings nor a few effects explain.
 
     Args:
         factors: Cholesky factors of the covariance that weights the windows of each part.
-        of_readings: the same factors for the noise of the readings alone.
+        reading_factors: the same factors for the noise of the readings alone.
         size: number of base coordinates.
     """
-    readings, places = linear.readings, linear.integrals.places
-    columns, e = (np.asarray(x) for x in (linear.jacobian, linear.residual))
-    signatures = np.zeros((len(e), linear.signatures.shape[1]))
+    readings = linear.readings
+    places = linear.integrals.places
+    columns, residuals = (np.asarray(x) for x in (linear.jacobian, linear.residual))
+    signatures = np.zeros((len(residuals), linear.signatures.shape[1]))
     signatures[:readings] = linear.signatures
     for _ in range(FITTED + 1):
-        q = np.linalg.qr(columns)[0]
-        left, rest = e - q @ (q.T @ e), signatures - q @ (q.T @ signatures)
-        norm = np.linalg.norm(rest, axis=0)
+        basis = np.linalg.qr(columns)[0]
+        unexplained, remaining_signatures = (
+            residuals - basis @ (basis.T @ residuals),
+            signatures - basis @ (basis.T @ signatures),
+        )
+        norm = np.linalg.norm(remaining_signatures, axis=0)
         norm = np.where(norm > 1e-3 * np.linalg.norm(signatures, axis=0), norm, np.inf)
-        best = int(np.argmax(np.abs(rest.T @ left) / norm))
-        columns = np.concatenate([columns, signatures[:, [best]]], 1)
-    by_window = left[:readings].reshape(linear.rows, -1)[:, list(places)]
-    plain = [
+        strongest = int(np.argmax(np.abs(remaining_signatures.T @ unexplained) / norm))
+        columns = np.concatenate([columns, signatures[:, [strongest]]], 1)
+    by_window = unexplained[:readings].reshape(linear.rows, -1)[:, list(places)]
+    window_errors = [
         (x @ by_window[k].T.ravel()).reshape(len(places), -1).T
         for k, x in zip(np.split(np.arange(linear.rows), len(parts)), factors, strict=True)
     ]
-    noise = [np.sum(x**2, 1).reshape(len(places), -1).T for x in of_readings]
+    noise = [np.sum(x**2, 1).reshape(len(places), -1).T for x in reading_factors]
     unit = [np.tile(np.sum(w.weight**2 / w.steps, 1)[:, None], len(places)) for w in parts]
-    counts, run = weight[:, places[0]] > 0, np.asarray(linear.run)
-    free = counts.sum() / max(counts.sum() - (size + FITTED) / len(places), 1.0)
-    of_windows = (np.concatenate(x)[counts] for x in (plain, noise, unit))
+    counts = weight[:, places[0]] > 0
+    run = np.asarray(linear.run)
+    freedom_ratio = counts.sum() / max(counts.sum() - (size + FITTED) / len(places), 1.0)
+    of_windows = (np.concatenate(x)[counts] for x in (window_errors, noise, unit))
     defect, variance, per_intensity = of_windows
-    white = by_window[counts] / np.maximum(np.sqrt(np.mean(by_window[counts] ** 2, 0)), 1e-300)
-    slow = [
-        variance_of_sums([white[run[counts] == k, e] for k in np.unique(run[counts])]) for e in range(len(places))
+    scaled = by_window[counts] / np.maximum(np.sqrt(np.mean(by_window[counts] ** 2, 0)), 1e-300)
+    variance_ratios = [
+        variance_of_sums([scaled[run[counts] == k, equation] for k in np.unique(run[counts])])
+        for equation in range(len(places))
     ]
-    return np.sqrt(slow) * weak_form.disturbance_intensities(defect * np.sqrt(free), variance, per_intensity)
+    return np.sqrt(variance_ratios) * weak_form.disturbance_intensities(
+        defect * np.sqrt(freedom_ratio), variance, per_intensity
+    )

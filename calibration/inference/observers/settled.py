@@ -80,8 +80,8 @@ class SettledLinearization(Linearization):
     """
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
-        changes = self.of_sides(balance)[:, :, :, None] * of_sides[:, :, None, :]
+        errors_of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
+        changes = self.of_sides(balance)[:, :, :, None] * errors_of_sides[:, :, None, :]
         return changes.sum(0).reshape(-1, shapes.shape[1])
 
     def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
@@ -90,10 +90,10 @@ class SettledLinearization(Linearization):
 
     def along_of_sides(self, balance: str) -> np.ndarray:
         """Change of the readings by a defect along the travel, shape (sides, rows, channels)."""
-        way = self.variable(direction_signal(balance)).reshape(-1, self.rows)
-        return np.asarray(self.of_sides(self.probed.index(balance))) * way[:, :, None]
+        direction = self.variable(direction_signal(balance)).reshape(-1, self.rows)
+        return np.asarray(self.of_sides(self.probed.index(balance))) * direction[:, :, None]
 
-    def places(self) -> np.ndarray:
+    def revealing_rows(self) -> np.ndarray:
         return np.arange(self.rows)
 
 
@@ -118,7 +118,7 @@ class SettledRuns(Observer):
         "configuration",
     )  # fmt: skip
     policy: ClassVar[SearchPolicy] = SearchPolicy()
-    rows_tell: ClassVar[bool] = True
+    one_row_reveals: ClassVar[bool] = True
     evidence: ClassVar[Names] = ("single", "curve", "pair", "chi2")
     linearization: ClassVar[type[SettledLinearization]] = SettledLinearization
     shape_sides: ClassVar[tuple[int, ...]] = ()  # of values that differ between sides
@@ -132,18 +132,18 @@ class SettledRuns(Observer):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledRuns:
-        fidelity_facts = fidelities.get_fidelity(fidelity or "steady")
+        simulation = fidelities.get_fidelity(fidelity or "steady")
         conditions = runs.conditions(robot)
-        if conditions.held is not None and fidelity_facts.name != "steady":
+        if conditions.held is not None and simulation.name != "steady":
             raise BadConfiguration(
-                f"{runs.source}, held: got model {fidelity_facts.name}; expected steady, which has a clamp"
+                f"{runs.source}, held: got model {simulation.name}; expected steady, which has a clamp"
             )
-        if not fidelity_facts.facts.rollout:
+        if not simulation.facts.rollout:
             try:
-                fidelity_facts.check(robot, conditions, fidelity_facts.facts.resolved())
+                simulation.check(robot, conditions, simulation.facts.resolved())
             except ValueError as error:
                 raise BadConfiguration(f"{runs.source}, settled runs: {error}") from error
-        return cls(conditions, fidelity_facts.name)
+        return cls(conditions, simulation.name)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -159,42 +159,50 @@ class SettledRuns(Observer):
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
         """Rejects a table of one condition with readings that differ. Notes the repeats that differ most."""
-        measured, alike = runs.measured(), rows_of_same_conditions(runs)
-        least, conflicts = cls.least(runs), list[tuple[int, int, int, str]]()
-        shared = np.array([source == "series" for source in noise.source])
-        usual = np.array([c.sd_share for c in runs.channels])
-        for rows in alike:
-            readings_there, sds = measured[rows], noise.sd[rows]
-            distance = np.abs(readings_there[:, None] - readings_there)
-            mean = np.maximum(np.abs(readings_there[:, None] + readings_there) / 2, least[rows])
+        measured = runs.measured()
+        groups = rows_of_same_conditions(runs)
+        least = cls.least(runs)
+        conflicts = list[tuple[int, int, int, str]]()
+        is_from_series = np.array([source == "series" for source in noise.source])
+        usual_shares = np.array([c.sd_share for c in runs.channels])
+        for rows in groups:
+            repeats, sds = measured[rows], noise.sd[rows]
+            distance = np.abs(repeats[:, None] - repeats)
+            mean = np.maximum(np.abs(repeats[:, None] + repeats) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             # An estimate of the noise from the scatter of these readings cannot test that scatter.
-            allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
+            allowed = np.where(
+                is_from_series, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual_shares * mean), allowed
+            )
             for one, other, k in np.argwhere(distance > allowed)[:1].tolist():
-                cell, as_share = (one, other, k), noise.estimated[k] or shared[k]
-                apart = f"{distance[cell] / mean[cell]:.0%}" if as_share else f"{distance[cell] / sd[cell]:.0f} sd"
-                conflicts.append((int(rows[one]), int(rows[other]), k, apart))
+                place = (one, other, k)
+                as_share = noise.estimated[k] or is_from_series[k]
+                distance_words = (
+                    f"{distance[place] / mean[place]:.0%}" if as_share else f"{distance[place] / sd[place]:.0f} sd"
+                )
+                conflicts.append((int(rows[one]), int(rows[other]), k, distance_words))
         remarks: list[Remark | str] = []
         if runs.whole is not runs:
             remarks.append(Remark("thinned_table", source=runs.source, rows=len(runs.whole), kept=len(runs)))
-        for first, second, k, apart in conflicts[:1]:
-            column, cells = runs.channels[k].column, {**runs.extras, **runs.columns}
+        for first, second, k, distance_words in conflicts[:1]:
+            column = runs.channels[k].column
+            columns = {**runs.extras, **runs.columns}
             others = [c for c, x in runs.extras.items() if x.dtype.kind == "f"]
             others += [c for c in (LOAD,) if c != column and runs.has(c)]
-            others = [c for c in others if cells[c][first] != cells[c][second]]
+            others = [c for c in others if columns[c][first] != columns[c][second]]
             remark = Remark(
                 "repeats",
                 source=runs.source,
                 rows=(first + 1, second + 1),
                 column=column,
                 values=(float(runs[column][first]), float(runs[column][second])),
-                apart=apart,
+                apart=distance_words,
                 unused=tuple(others),
                 near=runs.layout.nearest(others[0], runs.columns) if others else "",
                 more=len(conflicts) - 1,
             )
-            if len(alike) == 1:
+            if len(groups) == 1:
                 raise BadData(f"{describe(remark)}; no condition varies")
             remarks.append(remark)
         return remarks
@@ -227,10 +235,12 @@ class SettledRuns(Observer):
         implicit = self._implicit
         return None if implicit is None else jax.vmap(lambda c: implicit.solve(robot, c))(self.conditions)
 
-    def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
+    def observation_at_unknowns(
+        self, robot: Robot, unknowns: Array, is_solved: Array
+    ) -> tuple[Observation, Signals, Array]:
         assert self._implicit is not None
-        shown_run = functools.partial(self._implicit.results_at, robot)
-        result, signals, residual = jax.vmap(shown_run)(self.conditions, unknowns, found)
+        results_at_unknowns = functools.partial(self._implicit.results_at, robot)
+        result, signals, residual = jax.vmap(results_at_unknowns)(self.conditions, unknowns, is_solved)
         return self._simulated_readings(robot, result), signals, residual
 
     def operating_points(self, robot: Robot) -> Signals | None:
@@ -254,19 +264,24 @@ class SettledRuns(Observer):
         A signature is the sensitivity of the readings to a defect of the effect's balance, times the effect's term.
         This is exact, because an effect enters one balance and is linear in its amplitude.
         """
-        kind, data = self.linearization, problem.data
-        probes = tuple(balance_probe(b) for b in kind.probed)
-        robot, size, channel_names = problem.robot(z), z.size, channels.channel_names(problem.channels)
+        linearization = self.linearization
+        data = problem.data
+        probes = tuple(balance_probe(b) for b in linearization.probed)
+        robot = problem.robot(z)
+        size = z.size
+        channel_names = channels.channel_names(problem.channels)
 
         def probed(x: Array) -> Robot:
             delta = x[size:].reshape(len(probes), *self.shape_sides)
             return with_probes(problem.robot(x[:size]), probes, delta)
 
         z_and_probes = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
-        r, slopes, _, signals = problem.linearised(probed, z_and_probes)
-        r, slopes = zero_inactive_residuals(r, slopes, adhesion_penalty_slice(data))
-        jacobian = jnp.concatenate([slopes, jnp.eye(size, z_and_probes.size)])
-        residual = jnp.concatenate([r, z - data.centre])
+        residual_of_readings, slopes_of_readings, _, signals = problem.linearised(probed, z_and_probes)
+        residual_of_readings, slopes_of_readings = zero_inactive_residuals(
+            residual_of_readings, slopes_of_readings, adhesion_penalty_slice(data)
+        )
+        jacobian = jnp.concatenate([slopes_of_readings, jnp.eye(size, z_and_probes.size)])
+        residual = jnp.concatenate([residual_of_readings, z - data.centre])
         rows, count = data.measured.shape
         defects = jacobian[: rows * count, size:].reshape(rows, count, len(probes), -1).transpose(2, 3, 0, 1)
         if signals is None:
@@ -283,15 +298,15 @@ class SettledRuns(Observer):
             if effect.balance == "sensor":
                 term = term @ side_shares(effect.channel, term.shape[1])
                 change = term[:, None] * (jnp.arange(count) == channel_names.index(effect.channel)) * scale
-            elif effect.balance in kind.probed:
-                change = (term.T[:, :, None] * defects[kind.probed.index(effect.balance)]).sum(0)
+            elif effect.balance in linearization.probed:
+                change = (term.T[:, :, None] * defects[linearization.probed.index(effect.balance)]).sum(0)
             else:
                 change = jnp.zeros((rows, count))
             return change.ravel()
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
         defects = defects.reshape(len(probes), *self.shape_sides, rows, count)
-        return kind(
+        return linearization(
             residual, jacobian[:, :size], finite_or_zero(signatures), defects, scale, signals, channels=channel_names,
             magnitudes=robot.rig.magnitudes,
         )  # fmt: skip
@@ -304,7 +319,8 @@ class SettledRuns(Observer):
         Readings are drawn with their sds, and bench values too, because a prior is an earlier measurement. Each refit
         is the search that found the fit, from the true coordinates.
         """
-        data, count = problem.data, len(keys)
+        data = problem.data
+        count = len(keys)
         clean = data.measured + data.sd * linear.by_row()  # for included readings
         measured, centre = jax.device_get(_draw_tables(clean, data.sd, z, keys, jnp.asarray(factors)))
         start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
@@ -332,7 +348,8 @@ class SettledRuns(Observer):
         rivals: bool = False,
         most: int | None = None,
     ) -> tuple[Optimum, Observation]:
-        data, count = problem.data, len(starts)
+        data = problem.data
+        count = len(starts)
         measured, centre = (np.repeat(np.asarray(x)[None], count, 0) for x in (data.measured, data.centre))
         search_inputs = np.asarray(starts), np.asarray(weights), measured, centre
         members = SearchMember(*search_inputs, active=None if active is None else np.asarray(active))
@@ -401,20 +418,25 @@ def _row_defects(linear: Linearization, included: np.ndarray) -> Columns:
     """
     assert isinstance(linear, SettledLinearization)
     rows = np.flatnonzero(included)
-    slopes = np.stack([np.asarray(linear.along_of_sides(b))[:, rows] for b in EQUATIONS])
-    about = [np.asarray(getattr(linear.signals, name))[rows] for name in EQUATIONS.values()]
-    sides, size = slopes.shape[1], np.array([root_mean_square(x) for x in about])
-    made, turning, output = (
+    sensitivities = np.stack([np.asarray(linear.along_of_sides(b))[:, rows] for b in EQUATIONS])
+    signals_of_equations = [np.asarray(getattr(linear.signals, name))[rows] for name in EQUATIONS.values()]
+    sides = sensitivities.shape[1]
+    sizes = np.array([root_mean_square(x) for x in signals_of_equations])
+    motor_torque, motor_speed, output_speed = (
         root_mean_square(np.asarray(getattr(linear.signals, name))[rows])
         for name in ("torque_electromagnetic", "speed_motor", "speed_output")
     )
-    k = [*EQUATIONS].index("track")
-    size[k] = max(size[k], LOST * made * turning / max(output, 1e-12))
-    slopes = (slopes * size[:, None, None, None]).reshape(-1, *slopes.shape[2:]).transpose(1, 2, 0)
-    gram_matrix = slopes @ slopes.transpose(0, 2, 1) + np.eye(slopes.shape[1])
-    shares = -slopes.transpose(0, 2, 1) @ np.linalg.solve(gram_matrix, np.asarray(linear.by_row())[rows, :, None])
+    track = [*EQUATIONS].index("track")
+    sizes[track] = max(sizes[track], LOST * motor_torque * motor_speed / max(output_speed, 1e-12))
+    sensitivities = (
+        (sensitivities * sizes[:, None, None, None]).reshape(-1, *sensitivities.shape[2:]).transpose(1, 2, 0)
+    )
+    gram_matrix = sensitivities @ sensitivities.transpose(0, 2, 1) + np.eye(sensitivities.shape[1])
+    scaled_defects = -sensitivities.transpose(0, 2, 1) @ np.linalg.solve(
+        gram_matrix, np.asarray(linear.by_row())[rows, :, None]
+    )
     defects = np.full((len(EQUATIONS) * sides, len(included)), np.nan)
-    defects[:, rows] = np.repeat(size, sides)[:, None] * shares[:, :, 0].T
+    defects[:, rows] = np.repeat(sizes, sides)[:, None] * scaled_defects[:, :, 0].T
     names = [f"{b}_{side}" for b in EQUATIONS for side in channels.SIDES] if sides > 1 else EQUATIONS
     return dict(zip(names, defects, strict=True))
 
@@ -429,8 +451,10 @@ def _run_directions(observe: SettledRuns, robot: Robot) -> Float[Array, " rows"]
 def _draw_tables(clean: Array, sd: Array, z: Array, keys: Array, factors: Array) -> tuple[Array, Array]:
     """Readings and bench values of a table for each key, with its sds times its factors."""
 
-    def one(key: Array, factors: Array) -> tuple[Array, Array]:
-        one, two = jax.random.split(jax.random.wrap_key_data(key))
-        return clean + sd * factors * jax.random.normal(one, clean.shape), z + jax.random.normal(two, z.shape)
+    def draw(key: Array, factors: Array) -> tuple[Array, Array]:
+        reading_key, prior_key = jax.random.split(jax.random.wrap_key_data(key))
+        return clean + sd * factors * jax.random.normal(reading_key, clean.shape), z + jax.random.normal(
+            prior_key, z.shape
+        )
 
-    return jax.vmap(one)(keys, factors)
+    return jax.vmap(draw)(keys, factors)

@@ -70,13 +70,13 @@ class SettledEnds:
         conditions: conditions at each end, shape (ends,).
         mean, sd: means and their standard deviations [SI], shape (ends, channels). NaN if a channel is not measured
             or not settled.
-        shown: the same means, whether settled or not.
+        all_means: the same means, whether settled or not.
     """
 
     conditions: Conditions
     mean: np.ndarray
     sd: np.ndarray
-    shown: np.ndarray
+    all_means: np.ndarray
 
 
 def settled_ends_of_runs(problem: Problem) -> SettledEnds:
@@ -85,33 +85,36 @@ def settled_ends_of_runs(problem: Problem) -> SettledEnds:
     data = problem.data
     measured, sd, weight = (np.asarray(x) for x in (data.measured, data.sd, data.weight))
     time = np.asarray(observe.time)
-    stretches = [s for run in observe.stretches() for s in run]
-    ends = [s for s in stretches if s.whole or (s.driven and len(s.after(time, 1 - END)) >= FEWEST)] or stretches[:1]
-    mean, error, readings = (np.full((len(ends), measured.shape[1]), np.nan) for _ in range(3))
-    for k, stretch in enumerate(ends):
-        end = stretch.after(time, 1 - END) if stretch.driven else stretch.rows[:0]
+    intervals = [s for run in observe.constant_intervals() for s in run]
+    ends = [s for s in intervals if s.whole or (s.driven and len(s.after(time, 1 - END)) >= FEWEST)] or intervals[:1]
+    mean, error_of_mean, all_means = (np.full((len(ends), measured.shape[1]), np.nan) for _ in range(3))
+    for k, interval in enumerate(ends):
+        end_rows = interval.after(time, 1 - END) if interval.driven else interval.rows[:0]
         for c in range(measured.shape[1]):
-            these = end[weight[end, c] > 0]
-            if len(these) < FEWEST:
+            read_rows = end_rows[weight[end_rows, c] > 0]
+            if len(read_rows) < FEWEST:
                 continue
-            readings[k, c] = measured[these, c].mean()
-            first, second = np.array_split(measured[these, c], 2)
-            noise, size = 2 * np.median(sd[these, c]) / np.sqrt(len(these)), abs(readings[k, c])
+            all_means[k, c] = measured[read_rows, c].mean()
+            first, second = np.array_split(measured[read_rows, c], 2)
+            noise = 2 * np.median(sd[read_rows, c]) / np.sqrt(len(read_rows))
+            size = abs(all_means[k, c])
             if abs(second.mean() - first.mean()) < max(CHANGE * size, CHANGE_SD * noise):
-                mean[k, c], error[k, c] = readings[k, c], max(noise / 2, FLOOR * size)
+                mean[k, c], error_of_mean[k, c] = all_means[k, c], max(noise / 2, FLOOR * size)
     conditions = observe.conditions
     if observe.varying:
         rows = np.array([s.rows[0] for s in ends])
         conditions = jax.tree.map(lambda x: x[rows], observe.of_rows)
     # Ends that are not driven forwards have no readings here, so any conditions of steady travel are possible.
-    driven = jnp.asarray([s.driven for s in ends])
+    is_driven = jnp.asarray([s.driven for s in ends])
     conditions = dataclasses.replace(
         conditions,
-        voltage=jnp.where(driven, conditions.voltage, 24.0),
-        duty=jnp.where(driven, conditions.duty, 1.0),
-        open=jnp.where(driven, conditions.open, 0.0),
+        voltage=jnp.where(is_driven, conditions.voltage, 24.0),
+        duty=jnp.where(is_driven, conditions.duty, 1.0),
+        open=jnp.where(is_driven, conditions.open, 0.0),
     )
-    return SettledEnds(conditions, mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), readings)
+    return SettledEnds(
+        conditions, mean, np.where(np.isfinite(error_of_mean), np.maximum(error_of_mean, 1e-12), np.nan), all_means
+    )
 
 
 def starts_from_settled_ends(
@@ -131,8 +134,8 @@ def starts_from_settled_ends(
         [ends, np.where(friction, _spread_over_surfaces(problem, draws), ends[0]), 0 * ends[:1], draws]
     )
     data = problem.data
-    count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
-    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
+    counts = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
+    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / counts)
     blunt = problem.with_data(sd=jnp.hypot(data.sd, BLUNT * rms))
     optima = search(blunt, _recombine_points(blunt, points)[:searches], STEPS_BLUNT)
     sorted_optima = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
@@ -150,20 +153,22 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
 
     μ_s, V_s and V_d have their nominal ratios to μ_d and to each other, in one configuration or in all.
     """
-    c, points, parameters = problem.coordinates, [], z.copy()
+    c = problem.coordinates
+    points = []
+    in_all_configurations = z.copy()
     value, nominal = np.asarray(c.value(z)), np.asarray(c.value(np.zeros(len(c))))
     for name in problem.base.configurations:
         names = [f"{name}.{x}" for x in (*GRIP, *SLIDING)]
         if not set(names[:3]) <= set(c.names):
             continue
         static, creep, dynamic, *sliding = (c.names.index(n) for n in names if n in c.names)
-        rise = value[dynamic] / nominal[dynamic] * nominal[static] / value[static]
-        new = {static: value[static] * rise, creep: value[creep] * rise}
-        new |= {k: new[creep] * nominal[k] / nominal[creep] for k in sliding}
+        peak_ratio = value[dynamic] / nominal[dynamic] * nominal[static] / value[static]
+        new_values = {static: value[static] * peak_ratio, creep: value[creep] * peak_ratio}
+        new_values |= {k: new_values[creep] * nominal[k] / nominal[creep] for k in sliding}
         points.append(z.copy())
-        for k, x in new.items():
-            points[-1][k] = parameters[k] = _coordinate_of_value(problem, k, x)
-    return np.stack([*points, parameters])
+        for k, x in new_values.items():
+            points[-1][k] = in_all_configurations[k] = _coordinate_of_value(problem, k, x)
+    return np.stack([*points, in_all_configurations])
 
 
 def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
@@ -172,23 +177,23 @@ def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
     Shared parameters come from the point that fits all runs best.
     """
     observe: Histories = problem.observe  # type: ignore[assignment]
-    filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
-    first_part, *parts = filled.reshape(-1, TOGETHER, points.shape[1])
+    padded = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
+    first_part, *parts = padded.reshape(-1, TOGETHER, points.shape[1])
     first_misfits = _reading_misfits(problem, first_part)  # compiles the program
     with Threads(CORES) as cores:
         misfits = [first_misfits, *cores.map(lambda part: _reading_misfits(problem, part), parts)]
-    by_row = np.sum(np.concatenate(misfits)[: len(points)] ** 2, 2)
-    summed = np.zeros((len(points), len(observe.rows_of)))
-    np.add.at(summed.T, np.asarray(observe.run), by_row.T)
-    by_run = np.where(np.isfinite(summed), summed, np.inf)
-    mixed = np.tile(points[int(np.argmin(by_run.sum(1)))], (len(points), 1))
+    misfit_of_rows = np.sum(np.concatenate(misfits)[: len(points)] ** 2, 2)
+    misfit_of_runs = np.zeros((len(points), len(observe.rows_of)))
+    np.add.at(misfit_of_runs.T, np.asarray(observe.run), misfit_of_rows.T)
+    misfit_or_infinity = np.where(np.isfinite(misfit_of_runs), misfit_of_runs, np.inf)
+    recombined = np.tile(points[int(np.argmin(misfit_or_infinity.sum(1)))], (len(points), 1))
     configuration = np.asarray(problem.observe.conditions.configuration)
     for k, name in enumerate(problem.base.configurations):
-        columns = [j for j, n in enumerate(problem.coordinates.names) if n.startswith(f"{name}.")]
-        if columns and (configuration == k).any():
-            order = np.argsort(by_run[:, configuration == k].sum(1), kind="stable")
-            mixed[:, columns] = points[order][:, columns]
-    return mixed
+        parameters = [j for j, n in enumerate(problem.coordinates.names) if n.startswith(f"{name}.")]
+        if parameters and (configuration == k).any():
+            order = np.argsort(misfit_or_infinity[:, configuration == k].sum(1), kind="stable")
+            recombined[:, parameters] = points[order][:, parameters]
+    return recombined
 
 
 def _spread_over_surfaces(problem: Problem, draws: np.ndarray) -> np.ndarray:
@@ -202,8 +207,8 @@ def _spread_over_surfaces(problem: Problem, draws: np.ndarray) -> np.ndarray:
         for k, name in enumerate(problem.coordinates.names):
             for suffix, (low, high) in SURFACES.items():
                 if name.endswith(suffix):
-                    share = ndtr(z[k])
-                    z[k] = _coordinate_of_value(problem, k, low * (high / low) ** share)
+                    probability = ndtr(z[k])
+                    z[k] = _coordinate_of_value(problem, k, low * (high / low) ** probability)
         points.append(_with_friction_slope(problem, z, 1.0))
     return np.stack(points)
 
@@ -222,14 +227,16 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
     mean = np.where(_slides_at_end(problem, ends)[:, None], np.nan, ends.mean)
     observe = SettledRuns(ends.conditions, "steady")
     ends_problem = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
-    pinned, is_pinned = np.zeros((len(ADHESIONS), len(names))), np.zeros((len(ADHESIONS), len(names)), bool)
+    fixed_values, is_fixed = np.zeros((len(ADHESIONS), len(names))), np.zeros((len(ADHESIONS), len(names)), bool)
     for k in (k for k, n in enumerate(names) if n.endswith(STATIC)):
-        pinned[:, k], is_pinned[:, k] = [_coordinate_of_value(problem, k, x) for x in ADHESIONS], True
-    fitted = jax.device_get(fit_with_held(ends_problem, jnp.asarray(pinned), jnp.asarray(is_pinned), STEPS))
-    free = fit_with_held(ends_problem, jnp.asarray(fitted.z), jnp.zeros(is_pinned.shape, bool), STEPS)
-    free = jax.device_get(free)
-    best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
-    finite_points = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
+        fixed_values[:, k], is_fixed[:, k] = [_coordinate_of_value(problem, k, x) for x in ADHESIONS], True
+    fits_at_adhesions = jax.device_get(
+        fit_with_held(ends_problem, jnp.asarray(fixed_values), jnp.asarray(is_fixed), STEPS)
+    )
+    free_fits = fit_with_held(ends_problem, jnp.asarray(fits_at_adhesions.z), jnp.zeros(is_fixed.shape, bool), STEPS)
+    free_fits = jax.device_get(free_fits)
+    best = free_fits.z[int(np.argmin(np.where(np.isfinite(free_fits.cost), free_fits.cost, np.inf)))]
+    finite_points = [z for z in (best, *fits_at_adhesions.z) if np.all(np.isfinite(z))]
     return np.stack([_with_friction_slope(problem, z, share) for z in finite_points for share in FINER])
 
 
@@ -237,13 +244,13 @@ def _slides_at_end(problem: Problem, ends: SettledEnds) -> np.ndarray:
     """True for each run whose tracks or wheels spin at its end, even if it still gains speed, shape (runs,)."""
     if not {"motor_speed", "speed"} <= set(problem.base.rig.channels):
         return np.zeros(len(ends.mean), bool)
-    turning, travelling = (
-        ends.shown[:, channels.channel_index(c, problem.channels)] for c in ("motor_speed", "speed")
+    motor_speed, speed = (
+        ends.all_means[:, channels.channel_index(c, problem.channels)] for c in ("motor_speed", "speed")
     )
     radius = np.array([float(c.radius) for c in problem.base.configurations.members])
-    circumference = radius[np.asarray(ends.conditions.configuration)] * turning
+    mover_speed = radius[np.asarray(ends.conditions.configuration)] * motor_speed
     with np.errstate(invalid="ignore", divide="ignore"):
-        slip = 1 - travelling / (circumference / float(problem.base.gearbox.ratio))
+        slip = 1 - speed / (mover_speed / float(problem.base.gearbox.ratio))
     return np.nan_to_num(slip) > SLIDES
 
 
@@ -259,12 +266,12 @@ def _with_friction_slope(problem: Problem, z: np.ndarray, share: float) -> np.nd
             value[k] *= share
     for k, name in enumerate(c.names):
         for follower, leader in TIED:
-            if name.endswith(follower) and (base_name := name.removesuffix(follower) + leader) in c.names:
-                j = c.names.index(base_name)
+            if name.endswith(follower) and (leader_name := name.removesuffix(follower) + leader) in c.names:
+                j = c.names.index(leader_name)
                 value[k] = nominal[k] * value[j] / nominal[j]
     coordinate = np.where(c.scale, np.log(np.maximum(value, 1e-12)), value)
-    changed = value != c.value(np.asarray(z))
-    return np.where(changed, (coordinate - np.asarray(c.location)) / np.asarray(c.spread), z)
+    is_changed = value != c.value(np.asarray(z))
+    return np.where(is_changed, (coordinate - np.asarray(c.location)) / np.asarray(c.spread), z)
 
 
 @compiled

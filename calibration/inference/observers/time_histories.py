@@ -73,13 +73,17 @@ ROUNDING = 1e-3
 
 
 def _to_rows(
-    of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
+    values_of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
 ) -> Float[Array, "rows ..."]:
     """Values of the samples of runs, rearranged into the rows of the table. Padding after the end of a run is
     dropped.
     """
-    place = jnp.where(rows_of < 0, rows, rows_of)
-    return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
+    rows_or_end = jnp.where(rows_of < 0, rows, rows_of)
+    return (
+        jnp.zeros((rows, *values_of_runs.shape[2:]), values_of_runs.dtype)
+        .at[rows_or_end]
+        .set(values_of_runs, mode="drop")
+    )
 
 
 #: Distance from the prior from which a fit that did not converge, of a log with a missing effect, is not scanned for
@@ -115,7 +119,7 @@ class HistoriesLinearization(Linearization):
         changes = jnp.einsum("rksc,rkt->rsct", defects, shapes[self.knots])
         return (_to_rows(changes, self.rows_of, self.rows) * self.scale[:, :, None]).reshape(-1, shapes.shape[1])
 
-    def places(self) -> np.ndarray:
+    def revealing_rows(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
 
     def runs(self) -> list[np.ndarray]:
@@ -126,22 +130,23 @@ class HistoriesLinearization(Linearization):
             return bases_room.ORDERS[name][0] * np.asarray(self.angle)
         return np.asarray(self.time) if name == "time" else super().variable(name)
 
-    def turned(self) -> np.ndarray | None:
+    def shaft_angle(self) -> np.ndarray | None:
         return np.asarray(self.angle)
 
     def series(self) -> Float[Array, "runs samples channels"]:
         """Whitened residuals of the readings of each run in the order of time, 0 beyond its last."""
         return jnp.where(self.rows_of[:, :, None] < 0, 0.0, self.by_row()[self.rows_of])
 
-    def memory(self) -> Array:
+    def autocorrelation(self) -> Array:
         """Statistic of Ljung and Box (1978) over all runs, as a normal deviate. The largest of the channels."""
-        x, rows = self.series(), self.rows_of
+        residuals = self.series()
+        rows = self.rows_of
         count = jnp.sum(rows >= 0, 1)[:, None]
-        power = jnp.sum(x**2, 1)
+        squares = jnp.sum(residuals**2, 1)
         lags = min(LAGS, rows.shape[1] // 4)
-        statistic = jnp.zeros(x.shape[-1])
+        statistic = jnp.zeros(residuals.shape[-1])
         for k in range(1, lags + 1):
-            r = jnp.sum(x[:, k:] * x[:, :-k], 1) / jnp.maximum(power, 1e-9)
+            r = jnp.sum(residuals[:, k:] * residuals[:, :-k], 1) / jnp.maximum(squares, 1e-9)
             weight = jnp.where(count > k, count * (count + 2) / jnp.maximum(count - k, 1), 0.0)
             statistic = statistic + jnp.sum(weight * r**2, 0)
         freedom = jnp.maximum(jnp.sum(jnp.minimum(lags, count - 1)), 1)
@@ -164,7 +169,7 @@ class Histories(Observer):
         knots: rows between which an error is linear, padded with the last one of the run, shape (runs, knots).
         delayed: True if imposed quantities may act later than their column states (`Rig.delay`). Readings are then
             taken earlier by the delay, between instants.
-        known: simulated runs of the observed robot. None: not yet simulated.
+        simulated_runs: simulated runs of the observed robot. None: not yet simulated.
     """
 
     word: ClassVar[str] = "sample"
@@ -172,7 +177,7 @@ class Histories(Observer):
     axis: ClassVar[str] = "time_s"
     blocks: ClassVar[Names] = ("slope", "voltage", "run", "part")
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
-    rows_tell: ClassVar[bool] = False
+    one_row_reveals: ClassVar[bool] = False
     evidence: ClassVar[Names] = ("single", "curve", "pair", "chi2", "white")
     searches: ClassVar[int | None] = 8
 
@@ -183,7 +188,7 @@ class Histories(Observer):
     rows_of: Int[Array, "runs samples"]
     knots: Int[Array, "runs knots"]
     delayed: bool = eqx.field(default=False, static=True)
-    known: LinearisedRun | None = None
+    simulated_runs: LinearisedRun | None = None
 
     @classmethod
     def accepts_table(cls, runs: Runs) -> bool:
@@ -209,21 +214,32 @@ class Histories(Observer):
                 "out, or remove backlash and stiffness"
             )
         names, run = np.unique(runs.run_names, return_inverse=True)
-        own_rows, log_rows = ([table.in_order(name) for name in names] for table in (runs, runs.whole))
-        grids, conditions, times = run_grids.grids_of_log(runs, robot, own_rows, log_rows, parts)
+        rows_by_run, log_rows_by_run = ([table.in_order(name) for name in names] for table in (runs, runs.whole))
+        grids, conditions, times = run_grids.grids_of_log(runs, robot, rows_by_run, log_rows_by_run, parts)
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
-        samples, rig = max(map(len, own_rows)), robot.rig
-        rows = np.stack([np.pad(m, (0, samples - len(m)), constant_values=-1) for m in own_rows])
-        most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
+        sample_count = max(map(len, rows_by_run))
+        rig = robot.rig
+        rows_of = np.stack(
+            [
+                np.pad(rows_of_run, (0, sample_count - len(rows_of_run)), constant_values=-1)
+                for rows_of_run in rows_by_run
+            ]
+        )
+        knot_count = min(sample_count, KNOTS, max(8, int(KNOT_STEPS / times.size)))
         # Evenly spaced rows of each run, including its first and last.
-        spaced = [m[np.unique(np.round(np.linspace(0, len(m) - 1, most)).astype(int))] for m in own_rows]
-        knots = np.stack([np.pad(k, (0, most - len(k)), "edge") for k in spaced])
+        knots_by_run = [
+            rows_of_run[np.unique(np.round(np.linspace(0, len(rows_of_run) - 1, knot_count)).astype(int))]
+            for rows_of_run in rows_by_run
+        ]
+        knots = np.stack(
+            [np.pad(knots_of_run, (0, knot_count - len(knots_of_run)), "edge") for knots_of_run in knots_by_run]
+        )
         if rig.begins is not None:
             order = [rig.begins.names.index(run_grids.initial_state_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
-        index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
+        indices = [jnp.asarray(x) for x in (run, instant, rows_of, knots)]
         delayed = not rig.inherits or DELAY in rig.stated or not rig.prompt
-        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=delayed)
+        return cls(conditions, jnp.asarray(times), indices[0], indices[1], indices[2], indices[3], delayed=delayed)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -266,10 +282,11 @@ class Histories(Observer):
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
         """Checks that histories begin at their first row, usually at rest, with one sample at a time."""
-        names, measured = runs.run_names, runs.measured()
+        names = runs.run_names
+        measured = runs.measured()
         # Current rises within a millisecond; speeds and angles do not.
-        resting = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
-        moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
+        begins_at_rest = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
+        channels_at_rest = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and begins_at_rest]
         for channel in (c for c in runs.present_channels if not c.over_time):
             raise BadData(
                 f"{runs.source}, {channel.column}: not modelled over time; remove the column, or give settled "
@@ -284,7 +301,7 @@ class Histories(Observer):
                     f"{runs.source}, time_s: run {name or '(no run_id)'} has {count.max()} samples at "
                     f"{times[count.argmax()]:g} s; give each run its own run_id"
                 )
-            for k in moving:
+            for k in channels_at_rest:
                 size = np.max(np.nan_to_num(np.abs(measured[run_rows, k])))
                 limit = max(RESTING * size, RESTING_SD * noise.sd[first, k])
                 if runs["time_s"][first] < EARLY and abs(measured[first, k]) > limit:
@@ -316,17 +333,18 @@ class Histories(Observer):
 
         In a run with changing conditions, the longest interval of forward drive counts, if it is long enough.
         """
-        time, measured = runs["time_s"], runs.measured()
-        stretches = [
+        time = runs["time_s"]
+        measured = runs.measured()
+        intervals = [
             max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
             for run in intervals_by_run(runs)
         ]
-        stretches = [s for s in stretches if s.driven and (s.whole or s.lasts >= LASTING)]
+        intervals = [s for s in intervals if s.driven and (s.whole or s.lasts >= LASTING)]
         if steady:
             speeds = measured[:, [c.zero_at_rest and c.directed for c in runs.channels]]
-            stretches = [s for s in stretches if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
-        settled_readings = [_medians(measured[s.after(time, 0.5)]) for s in stretches]
-        first, lasts = np.array([s.rows[0] for s in stretches], int), np.array([s.lasts for s in stretches])
+            intervals = [s for s in intervals if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
+        settled_readings = [_medians(measured[s.after(time, 0.5)]) for s in intervals]
+        first, lasts = np.array([s.rows[0] for s in intervals], int), np.array([s.lasts for s in intervals])
         return runs.where(first), np.reshape(settled_readings, (-1, measured.shape[1])), lasts
 
     @classmethod
@@ -343,7 +361,7 @@ class Histories(Observer):
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
     def changes(
-        self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...], kind: Any = float
+        self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...], number_type: Any = float
     ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
         """Changes of the readings by an error of the balance of each probe [unit of the balance], and by each effect
         at each point of its grid. A probe has amplitude 1. The error is 1 at a knot of a run and falls linearly to 0
@@ -351,28 +369,30 @@ class Histories(Observer):
 
         An effect with one amplitude enters one balance. So it changes a run as an error of that balance would, with
         the values of its term. Its memory follows from the run too. Between two instants, its change of a reading is
-        linear. `kind`: type of the numbers.
+        linear. `number_type`: type of the numbers.
         """
-        clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
+        knot_times = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
         rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
-        simulated = self.with_simulated_runs(robot).known
-        of_run = run_changes.changes_of_run(robot, probes, effects, kind=kind, delayed=self.delayed)
+        simulated_runs = self.with_simulated_runs(robot).simulated_runs
+        changes_of_run = run_changes.changes_of_run(
+            robot, probes, effects, number_type=number_type, delayed=self.delayed
+        )
         # One run at a time: each has a wide array, by its knots.
-        inputs = self.conditions, clock, self.instant[rows], simulated, self.times, self.time[rows]
-        knots, by_effects = jax.lax.map(lambda run: of_run(*run), inputs)
+        inputs = self.conditions, knot_times, self.instant[rows], simulated_runs, self.times, self.time[rows]
+        knots, by_effects = jax.lax.map(lambda run: changes_of_run(*run), inputs)
         return jnp.moveaxis(knots, 0, 1), by_effects
 
     def with_simulated_runs(self, robot: Robot) -> Histories:
         """Observer with the simulated runs of a robot."""
-        if self.known is not None:
+        if self.simulated_runs is not None:
             return self
         simulated = jax.vmap(lambda c, t: histories.linearise_run(robot, c, t))(self.conditions, self.times)
-        return dataclasses.replace(self, known=simulated)
+        return dataclasses.replace(self, simulated_runs=simulated)
 
     def signals_and_angle(self, robot: Robot) -> tuple[Signals, Array]:
         """Signals of a robot in each row, and the angle of its driving shaft since the start of the run [rad]."""
         run_signals = jax.vmap(lambda c, t, k: histories.history_signals(robot, c, t, k))
-        signals = run_signals(self.conditions, self.times, self.known)
+        signals = run_signals(self.conditions, self.times, self.simulated_runs)
         signals = jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), signals)
         speed = jnp.asarray(signals.speed_wheel)
         angle_steps = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
@@ -396,13 +416,15 @@ class Histories(Observer):
         """True if some conditions change within a run."""
         return any(x.ndim > 1 for x in jax.tree.leaves(self.conditions))
 
-    def stretches(self) -> list[list[ConstantInterval]]:
+    def constant_intervals(self) -> list[list[ConstantInterval]]:
         """Intervals of constant conditions in each run."""
-        rows_of, time, of_rows = np.asarray(self.rows_of), np.asarray(self.time), self.of_rows
-        volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
-        volts = volts if of_rows.motor_current is None else of_rows.motor_current
+        rows_of = np.asarray(self.rows_of)
+        time = np.asarray(self.time)
+        of_rows = self.of_rows
+        drive = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
+        drive = drive if of_rows.motor_current is None else of_rows.motor_current
         values = [x for name in run_grids.CHANGING if (x := getattr(of_rows, name)) is not None]
-        return [divide_run(rows[rows >= 0], time, values, volts) for rows in rows_of]
+        return [divide_run(rows[rows >= 0], time, values, drive) for rows in rows_of]
 
     @property
     def driven(self) -> Conditions:
@@ -414,10 +436,11 @@ class Histories(Observer):
             return self.conditions
         rows = self.of_rows
         if rows.held is not None:  # a clamp, not the drive, determines the motion
-            free, drives = rows.held < 0.5, ("voltage", "motor_current")
-            turned_by = {n: np.where(free, x, 0.0) for n in drives if (x := getattr(rows, n)) is not None}
-            rows = dataclasses.replace(rows, held=None, **turned_by)
-        braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _merge_levels(rows.load_torque)
+            free = rows.held < 0.5
+            drives = ("voltage", "motor_current")
+            drive_without_clamp = {n: np.where(free, x, 0.0) for n in drives if (x := getattr(rows, n)) is not None}
+            rows = dataclasses.replace(rows, held=None, **drive_without_clamp)
+        brake_torque = np.zeros(len(rows.voltage)) if rows.load_torque is None else _merge_levels(rows.load_torque)
         if rows.voltage_follows:
             channel = "motor_current" if rows.motor_speed is None else "motor_speed"
             drive = _merge_levels(getattr(rows, channel))
@@ -426,18 +449,20 @@ class Histories(Observer):
             key = [drive, rows.slope_deg, rows.payload]
         else:
             drive = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
-            way = np.where(drive < 0, -1.0, 1.0)
-            braked = way * braked
-            levels = {"voltage": np.abs(drive), "slope_deg": way * rows.slope_deg, "payload": rows.payload}
+            direction = np.where(drive < 0, -1.0, 1.0)
+            brake_torque = direction * brake_torque
+            levels = {"voltage": np.abs(drive), "slope_deg": direction * rows.slope_deg, "payload": rows.payload}
             levels = {name: _merge_levels(x) for name, x in levels.items()}
             key = [*levels.values()]
             levels |= {"duty": np.ones_like(rows.duty), "open": np.zeros_like(rows.open)}
-        levels |= {} if rows.load_torque is None else {"load_torque": braked}
-        some = np.flatnonzero(drive != 0) if (drive != 0).any() else np.arange(1)
-        cases = np.unique(np.stack([rows.configuration, *key, braked], 1)[some], axis=0, return_index=True)[1]
-        return run_grids.conditions_of_rows(dataclasses.replace(rows, **levels), some[cases])
+        levels |= {} if rows.load_torque is None else {"load_torque": brake_torque}
+        driven_rows = np.flatnonzero(drive != 0) if (drive != 0).any() else np.arange(1)
+        distinct_cases = np.unique(
+            np.stack([rows.configuration, *key, brake_torque], 1)[driven_rows], axis=0, return_index=True
+        )[1]
+        return run_grids.conditions_of_rows(dataclasses.replace(rows, **levels), driven_rows[distinct_cases])
 
-    def late(self, steps: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
+    def delayed_values(self, steps: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
         """Values within steps at the time of each row minus the delay of the rig.
 
         Args:
@@ -454,20 +479,20 @@ class Histories(Observer):
 
     def __call__(self, robot: Robot) -> Observation:
         def of_run(
-            conditions: Conditions, times: Array, known: LinearisedRun | None, instants: Array, time: Array
+            conditions: Conditions, times: Array, simulated_run: LinearisedRun | None, instants: Array, time: Array
         ) -> Array:
             """Readings in the rows of a run."""
             if not self.delayed:
-                return _readings(robot, histories.history_signals(robot, conditions, times, known, instants))
+                return _readings(robot, histories.history_signals(robot, conditions, times, simulated_run, instants))
             step, share = robot.rig.before(times, time)
-            course = histories.course_between_instants(robot, conditions, times, known, step)
+            course = histories.course_between_instants(robot, conditions, times, simulated_run, step)
             return StepCourse.read(_readings_within_steps(robot, course), share)
 
         places = self.instant[self.rows_of], self.time[self.rows_of]
-        of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
+        of_runs = jax.vmap(of_run)(self.conditions, self.times, self.simulated_runs, *places)
         reading = _to_rows(of_runs, self.rows_of, len(self.run))
-        followed = jnp.all(jnp.isfinite(reading), 1)
-        status = jnp.where(followed, CONVERGED, FAILED)
+        is_simulated = jnp.all(jnp.isfinite(reading), 1)
+        status = jnp.where(is_simulated, CONVERGED, FAILED)
         return Observation(reading, jnp.zeros(self.run.shape), status, jnp.zeros_like(status))
 
     @property
@@ -477,21 +502,24 @@ class Histories(Observer):
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return status == FAILED
 
-    def noise_misfit(self, off: Callable[[], np.ndarray], counts: np.ndarray) -> float:
+    def noise_misfit(self, residuals: Callable[[], np.ndarray], counts: np.ndarray) -> float:
         """Expected χ² of noise. It is larger than the number of readings if neighbouring samples show that the sds
         are too small.
 
         Model errors nearly cancel in the differences of neighbouring samples (von Neumann, Ann. Math. Stat. 12
         (1941)).
         """
-        residual, rows, total = off(), np.asarray(self.rows_of), 0.0
-        first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
+        whitened = residuals()
+        rows = np.asarray(self.rows_of)
+        total = 0.0
+        first = rows[:, :-1].ravel()
+        second = rows[:, 1:].ravel()
         has_both = (first >= 0) & (second >= 0)
-        for k in range(residual.shape[1]):
+        for k in range(whitened.shape[1]):
             is_compared = has_both & counts[first, k] & counts[second, k]
-            change = np.abs(residual[second[is_compared], k] - residual[first[is_compared], k])
-            usual = change[change <= JUMP * np.median(change)] if len(change) else np.zeros(1)
-            total += counts[:, k].sum() * max(1.0, float(np.mean(usual**2)) / 2)
+            change = np.abs(whitened[second[is_compared], k] - whitened[first[is_compared], k])
+            noise_changes = change[change <= JUMP * np.median(change)] if len(change) else np.zeros(1)
+            total += counts[:, k].sum() * max(1.0, float(np.mean(noise_changes**2)) / 2)
         return float(total)
 
     def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> HistoriesLinearization:
@@ -501,7 +529,8 @@ class Histories(Observer):
         are computed along its runs.
         """
         residual, jacobian, _, simulated = _evaluate_at(problem, z)
-        robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
+        robot = problem.robot(jnp.asarray(z))
+        observe = dataclasses.replace(self, simulated_runs=simulated)
         scale = problem.data.weight / problem.data.sd
         places = {*bases_room.balances_of(problem.base), *itertools.chain(*bases_room.STANDS_FOR.values())}
         probed = tuple(k for k, b in enumerate(PROBED) if b in places)
@@ -515,10 +544,10 @@ class Histories(Observer):
 
     def at_fit(self, problem: Problem, z: Numbers) -> Self:
         """Observer with its runs as simulated at coordinates z, by the program of the searches."""
-        return dataclasses.replace(self, known=_evaluate_at(problem, z)[3])
+        return dataclasses.replace(self, simulated_runs=_evaluate_at(problem, z)[3])
 
     def starts(
-        self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
+        self, problem: Problem, random: np.random.Generator, count: int, problem_of_log: Problem | None = None
     ) -> Float[np.ndarray, "starts z"]:
         """Starts of searches, see `Observer.starts`: the fit of the log's equations in weak form, if the log shows
         its states.
@@ -535,18 +564,18 @@ class Histories(Observer):
                 evaluate, starts, blunt.data, weights, steps, self.policy.batch, within=within
             )[0]
 
-        regression = fit_weak_form(problem if every is None else every)
-        begins = np.zeros((0, len(problem.coordinates))) if regression is None else regression.z[None]
+        regression = fit_weak_form(problem if problem_of_log is None else problem_of_log)
+        starts = np.zeros((0, len(problem.coordinates))) if regression is None else regression.z[None]
         if problem.base.has_ground and problem.base.rig.imposed == "voltage":
             # Configurations are combined from many points. A regression already determines the drive of a single one.
-            alone = regression is not None and len(problem.base.configurations) == 1
-            count_of_draws, searches = settled_ends.FEW if alone else settled_ends.MANY
+            is_drive_determined = regression is not None and len(problem.base.configurations) == 1
+            count_of_draws, searches = settled_ends.FEW if is_drive_determined else settled_ends.MANY
             draws = random.standard_normal((count_of_draws, len(problem.coordinates)))
             ends = settled_ends.starts_from_settled_ends(problem, draws, search_batch, searches)
-            begins = np.concatenate([begins, ends[: max(1, count - len(begins)) if regression is None else 1]])
+            starts = np.concatenate([starts, ends[: max(1, count - len(starts)) if regression is None else 1]])
         elif regression is None:
-            begins = super().starts(problem, random, count)
-        return scans.place_at_minimum(problem, begins[:count])
+            starts = super().starts(problem, random, count)
+        return scans.place_at_minimum(problem, starts[:count])
 
     def scanned(self, problem: Problem) -> tuple[int, ...]:
         return scans.wide_coordinates(problem)
@@ -559,10 +588,11 @@ class Histories(Observer):
         """
         if problem.coordinates.names[k] != DELAY:
             return SCANNED
-        motor, time = problem.base.motor, np.unique(np.round(np.asarray(self.time), 9))
+        motor = problem.base.motor
+        time = np.unique(np.round(np.asarray(self.time), 9))
         rise = float(motor.inductance / motor.resistance) if problem.base.rig.shows_voltage else np.inf
-        fine = min(0.125 * float(np.median(np.diff(time))), max(0.5 * rise, 1e-6)) if len(time) > 1 else 1.0
-        steps_needed = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / fine
+        spacing = min(0.125 * float(np.median(np.diff(time))), max(0.5 * rise, 1e-6)) if len(time) > 1 else 1.0
+        steps_needed = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / spacing
         return int(2 ** np.clip(np.ceil(np.log2(steps_needed)), *np.log2(DELAYS)))
 
     def scan(self, problem: Problem, z: Array, k: int, values: Array) -> tuple[Array, Array]:
@@ -591,8 +621,8 @@ class Histories(Observer):
     ) -> tuple[Optimum, Observation]:
         """Fits from several starts, see `Observer.search`. The runs are compiled once for all steps."""
         steps = self.policy.steps if most is None else most
-        of_same_readings = bool(np.all(weights == np.asarray(weights)[:1]))
-        within = optimizers.SAME if rivals else NEAR if of_same_readings else np.inf
+        have_same_readings = bool(np.all(weights == np.asarray(weights)[:1]))
+        within = optimizers.SAME if rivals else NEAR if have_same_readings else np.inf
 
         def search_from(starts: Numbers, members: slice = slice(None)) -> tuple[Optimum, Observation]:
             weight = np.asarray(weights)[members]
@@ -602,9 +632,9 @@ class Histories(Observer):
             )
 
         optima = search_from(starts)
-        near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
-        unended = ~np.asarray(optima[0].converged) & (np.asarray(optima[0].steps) >= steps)
-        if most is None and np.any(near & unended):  # a proposal has to be an optimum
+        is_near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
+        has_run_out = ~np.asarray(optima[0].converged) & (np.asarray(optima[0].steps) >= steps)
+        if most is None and np.any(is_near & has_run_out):  # a proposal has to be an optimum
             optima = search_from(np.asarray(optima[0].z))
         if not rivals or not self.scanned(problem):
             return optima
@@ -612,8 +642,8 @@ class Histories(Observer):
         if most is not None and not optima[0].converged[k] and np.abs(optima[0].z[k]).max() > LOST:
             return optima
 
-        def result_of_member(every: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
-            return jax.tree.map(lambda leaf: leaf[k], every)
+        def result_of_member(all_results: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
+            return jax.tree.map(lambda leaf: leaf[k], all_results)
 
         def search_again(z: np.ndarray) -> tuple[Optimum, Observation]:
             return result_of_member(search_from(z[None], slice(k, k + 1)), 0)
@@ -621,8 +651,9 @@ class Histories(Observer):
         best = scans.search_lower_minima(
             problem.with_data(weight=weights[k]), result_of_member(optima, k), search_again, lambda _: None
         )
-        put = lambda every, mine: np.concatenate([every[:k], np.asarray(mine)[None], every[k + 1 :]])  # noqa: E731
-        return jax.tree.map(put, optima, best)
+        return jax.tree.map(
+            lambda old, new: np.concatenate([old[:k], np.asarray(new)[None], old[k + 1 :]]), optima, best
+        )
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
@@ -639,8 +670,8 @@ class Histories(Observer):
         rows = self.of_rows
         angle, electromotive, ways = jax.tree.map(np.nan_to_num, _shaft_motion(self, robot))
         if (rows.duty != 1).any():
-            at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
-            columns = {**columns, "supply_voltage_V": at_motors}
+            motor_voltage = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
+            columns = {**columns, "supply_voltage_V": motor_voltage}
         configuration = self.conditions.configuration
         on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(configuration).on_tracks > 0.5, np.shape(configuration))
         scope = bases_room.CurveScope.of(robot, columns)
@@ -664,7 +695,8 @@ class Histories(Observer):
 
         def statistics_of_fit(diagnosis: Any) -> details.FitOverTime:
             lags = min(LAGS, self.rows_of.shape[1] // 4)
-            test, x = diagnosis.test, np.asarray(diagnosis.linear.series())
+            test = diagnosis.test
+            x = np.asarray(diagnosis.linear.series())
             power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
             by_lag = np.array([np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)])
             autocorrelation = dict(zip(diagnosis.linear.channels, by_lag.T.tolist(), strict=True))
@@ -696,20 +728,22 @@ def _check_signs(runs: Runs) -> None:
     """
     if runs.layout.imposed in GOALS:  # an output may turn away from its goal
         return
-    volts, measured = applied_drive(runs), runs.measured()
-    time, size = runs["time_s"], np.nanmax(np.abs(measured), 0, initial=0.0)
-    unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
-    unsigned &= [runs.turns_round(c) for c in runs.channels]
+    drive = applied_drive(runs)
+    measured = runs.measured()
+    time = runs["time_s"]
+    size = np.nanmax(np.abs(measured), 0, initial=0.0)
+    is_unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
+    is_unsigned &= [runs.turns_round(c) for c in runs.channels]
     unit = runs.layout.imposed_column.rpartition("_")[2]
     for run in intervals_by_run(runs):
-        for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
+        for s in (s for s in run if drive[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
-            for k in np.flatnonzero(unsigned):
+            for k in np.flatnonzero(is_unsigned):
                 channel, readings = runs.channels[k], measured[rows, k][np.isfinite(measured[rows, k])]
                 if readings.size and np.median(readings) > RESTING * size[k]:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
-                        f"{runs[channel.column][rows[0]]:g} {channel.unit} at {volts[rows[0]]:g} {unit}; "
+                        f"{runs[channel.column][rows[0]]:g} {channel.unit} at {drive[rows[0]]:g} {unit}; "
                         f"expected negative readings in reverse; or set [instruments.{channel.name}] signed = "
                         "false in the robot's file, if it shows a magnitude"
                     )
@@ -761,25 +795,25 @@ def _scan_delays(problem: Problem, z: Array, scanned: Array, values: Array) -> t
         def of_run(c: Conditions, t: Array, k: LinearisedRun | None) -> tuple[Array, ...]:
             return _readings_within_steps(robot, histories.course_between_instants(robot, c, t, k))
 
-        *readings, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
+        *readings, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.simulated_runs)
         return tuple(readings), (*readings, decays)
 
     slopes, (*readings, decays) = jax.jacfwd(within_steps, has_aux=True)(z)
     pairs = zip(readings, slopes, strict=True)
     steps = *(jnp.concatenate([x[..., None], slope], -1) for x, slope in pairs), decays
 
-    def one(value: Array) -> tuple[Array, Array]:
+    def minimum_at(value: Array) -> tuple[Array, Array]:
         coordinates = jnp.where(scanned, value, z)
-        late = observe.late(steps, problem.robot(coordinates).rig)
-        error = data.weight * (late[..., 0] - data.measured) / data.sd
-        finite = jnp.all(jnp.isfinite(late), -1)
+        delayed = observe.delayed_values(steps, problem.robot(coordinates).rig)
+        error = data.weight * (delayed[..., 0] - data.measured) / data.sd
+        finite = jnp.all(jnp.isfinite(delayed), -1)
         error = jnp.where(finite, error, MISSING * data.weight)
-        jacobian = jnp.where(finite[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
+        jacobian = jnp.where(finite[..., None], (data.weight / data.sd)[..., None] * delayed[..., 1:], 0.0)
         residual = jnp.concatenate([error.ravel(), coordinates - data.centre])
         full_jacobian = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
         return _minimum_with_one_held(residual, full_jacobian, coordinates, scanned)
 
-    return jax.lax.map(one, values, batch_size=16)
+    return jax.lax.map(minimum_at, values, batch_size=16)
 
 
 @compiled
@@ -794,10 +828,10 @@ def _minimum_with_one_held(residual: Array, jacobian: Array, z: Array, held: Arr
 def _evaluate(problem: Problem, z: Array) -> tuple[Array, Array, Observation, LinearisedRun]:
     """Result of `linearise_rollout` at z, and the simulated runs."""
     observe: Histories = problem.observe.with_simulated_runs(problem.robot(z))  # type: ignore[attr-defined]
-    assert observe.known is not None
+    assert observe.simulated_runs is not None
     r, jacobian, observation = optimizers.linearise_rollout(dataclasses.replace(problem, observe=observe), z)
     penalties = optimizers.adhesion_penalty_slice(problem.data)  # negative, because adhesion is not penalised
-    return *optimizers.zero_inactive_residuals(r, jacobian, penalties), observation, observe.known
+    return *optimizers.zero_inactive_residuals(r, jacobian, penalties), observation, observe.simulated_runs
 
 
 def _evaluate_at(problem: Problem, z: Numbers) -> tuple[Numbers, Numbers, Observation, LinearisedRun]:

@@ -63,10 +63,10 @@ class TurnLinearization(SettledLinearization):
     def variable(self, name: str) -> np.ndarray:
         return np.asarray(signal_by_point(self.signals, name), float)
 
-    def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
-        shares = np.stack([side_shares(name, len(of_sides)) for name in self.channels])
-        return super().shown(channel, jnp.tensordot(jnp.asarray(shares)[channel], of_sides, 1))
+    def channel_columns(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
+        errors_of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
+        shares = np.stack([side_shares(name, len(errors_of_sides)) for name in self.channels])
+        return super().channel_columns(channel, jnp.tensordot(jnp.asarray(shares)[channel], errors_of_sides, 1))
 
 
 class SettledTurns(SettledRuns):
@@ -78,7 +78,7 @@ class SettledTurns(SettledRuns):
 
     word: ClassVar[str] = "turns"
     blocks: ClassVar[Names] = ("run", TURN, "voltage", "payload", "configuration")
-    rows_tell: ClassVar[bool] = False  # a row has a defect on either side
+    one_row_reveals: ClassVar[bool] = False  # a row has a defect on either side
     library: ClassVar[Mapping[str, type[Effect]]] = effects.OF_TURNS
     menu: ClassVar[bool] = False
     policy: ClassVar[SearchPolicy] = SearchPolicy(searches=4)
@@ -119,7 +119,7 @@ class SettledTurns(SettledRuns):
         return dataclasses.replace(observation, adhesion_used=jnp.zeros_like(observation.adhesion_used))
 
     @property
-    def apart(self) -> bool:
+    def solves_separately(self) -> bool:
         return True
 
     def read(self, robot: Robot) -> Observation:
@@ -129,8 +129,8 @@ class SettledTurns(SettledRuns):
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
     ) -> tuple[Any, ...]:
         """Draws as in the protocol, with the roots at each refit."""
-        samples = super().draws(problem, z, linear, keys, factors)
-        return *samples, solve_rows_at(problem, samples[2])
+        tables = super().draws(problem, z, linear, keys, factors)
+        return *tables, solve_rows_at(problem, tables[2])
 
     def fit_replicate(
         self,
@@ -139,8 +139,8 @@ class SettledTurns(SettledRuns):
         linear: Linearization,
         drawn: tuple[Any, ...],
     ) -> Linearization:
-        rooted = dataclasses.replace(problem, roots=drawn[-1])
-        return super().fit_replicate(rooted, effects, linear, drawn[:-1])
+        problem_with_roots = dataclasses.replace(problem, roots=drawn[-1])
+        return super().fit_replicate(problem_with_roots, effects, linear, drawn[:-1])
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return super().unreachable(status) | (status == NOT_SETTLED)
@@ -153,10 +153,12 @@ class SettledTurns(SettledRuns):
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
         signals = results_of_rows(robot, self.conditions)[1]
         signal_values = {n: np.asarray(signal_by_point(signals, n)) for n in (*names, *WAYS)}
-        points = {bases_room.VARIABLES[v]: signal_values[v] for v in names}
-        points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
+        columns_by_point = {bases_room.VARIABLES[v]: signal_values[v] for v in names}
+        columns_by_point |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
         weight = np.tile(included.astype(float), 2)
-        lacking = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
+        balances = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
         axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], *VARIABLES_ROUND)  # what is imposed
-        scope = dataclasses.replace(bases_room.CurveScope.of(robot, points), balances=lacking, axes=axes)
-        return bases_room.families_of_table(points, weight, {way: signal_values[way] for way in WAYS}, scope)
+        scope = dataclasses.replace(bases_room.CurveScope.of(robot, columns_by_point), balances=balances, axes=axes)
+        return bases_room.families_of_table(
+            columns_by_point, weight, {way: signal_values[way] for way in WAYS}, scope
+        )
