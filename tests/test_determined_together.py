@@ -44,8 +44,8 @@ def test_the_combination_is_the_one_that_varies_least(correlation, kinds, spread
 
 def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.94, (LOG, LOG))) == ()
-    assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
-    pairs = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
+    assert determined_together(posterior(0.99, (LOG, LOG)), held_names=("a", "b")) == ()
+    pairs = determined_together(posterior(0.99, (LOG, LOG)), held_names=("a",))  # b is known by the prior of a
     assert describe(determination("a", True, pairs)) == "only with b"
     assert describe(determination("c", True, pairs)) == "no"
     assert undetermined_names(("a", "c"), pairs) == ("c",)

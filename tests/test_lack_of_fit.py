@@ -81,7 +81,7 @@ def test_a_drift_from_run_to_run_is_structure_and_no_wrong_sd():
 
 def judged(made, estimated=False):
     """Adequacy with the noise stated, or estimated from the misfit as `calibrate` does."""
-    return adequacy_of_residuals(made.rescaled() if estimated else made, known=not estimated)
+    return adequacy_of_residuals(made.rescaled() if estimated else made, noise_known=not estimated)
 
 
 @pytest.mark.slow

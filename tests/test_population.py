@@ -64,7 +64,7 @@ def evolve(posed, known, generations=30, seed=3, keep=lambda name, make: make())
     size = len(NAMES)
     return population.run_evolution(
         posed, population.member_objective(posed, known), np.zeros(size), np.eye(size), size=SIZE, seed=seed,
-        generations=generations, beside=np.empty((0, size)), tell=lambda step: None, keep=keep,
+        generations=generations, further_points=np.empty((0, size)), tell=lambda step: None, keep=keep,
     )  # fmt: skip
 
 

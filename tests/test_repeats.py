@@ -69,7 +69,7 @@ def test_the_probability_of_a_median_is_right(count):
 def test_every_command_takes_the_larger_noise():
     runs = table(0.2)
     ready = prepare_input(runs, robot_file.load_robot("nominal"), "current=0.02A,motor_speed=0.5%")
-    assert remarks_with_codes(ready.checked[:1], "larger_noise")
+    assert remarks_with_codes(ready.table_remarks[:1], "larger_noise")
     assert ready.noise.sd[0, 0] > 0.1
 
 

@@ -68,15 +68,15 @@ class DependentPair(NamedTuple):
         return {"a": self.one, "b": self.other, "correlation": self.correlation, "determined": describe(self)}
 
 
-def determination(name: str, held: bool, pairs: Iterable[DependentPair]) -> Remark:
+def determination(name: str, is_held: bool, pairs: Iterable[DependentPair]) -> Remark:
     """Remark on the determination of a parameter by the data.
 
     Args:
-        held: True if only its prior determines it.
+        is_held: True if only its prior determines it.
         pairs: all pairs that data determine only in combination.
     """
     others = tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other))
-    return Remark("determined", held=held, others=others)
+    return Remark("determined", held=is_held, others=others)
 
 
 # --- adequacy of a fit ----------------------------------------------------------------------------------

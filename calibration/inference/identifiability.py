@@ -214,14 +214,14 @@ def posterior_of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance
     )
 
 
-def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tuple[DependentPair, ...]:
+def determined_together(posterior: Posterior, held_names: Collection[str] = ()) -> tuple[DependentPair, ...]:
     """Pairs of parameters whose posterior correlation exceeds `TOGETHER`, strongest first, with the combination that
     is known.
 
     Args:
-        held: names of parameters that only their priors determine. A pair of two such parameters is omitted. In a
-            pair with one of them, the other is known only as well as that prior, and the data determine only their
-            combination.
+        held_names: names of parameters that only their priors determine. A pair of two such parameters is omitted.
+            In a pair with one of them, the other is known only as well as that prior, and the data determine only
+            their combination.
     """
     sd = np.sqrt(np.diag(posterior.covariance))
     value = posterior.at(posterior.mean)
@@ -231,7 +231,7 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     for i, j in zip(*np.triu_indices(len(sd), 1), strict=True):
         one, other = posterior.coordinates[i], posterior.coordinates[j]
         correlation = float(posterior.covariance[i, j] / max(sd[i] * sd[j], 1e-300))
-        if not abs(correlation) > TOGETHER or (one in held and other in held):
+        if not abs(correlation) > TOGETHER or (one in held_names and other in held_names):
             continue
         size = spread * np.where(log, value[: len(sd)], 1.0)
         weight = -np.sign(correlation) * abs(size[i] / size[j])
@@ -241,9 +241,9 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     return tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation)))
 
 
-def undetermined_names(held: Collection[str], pairs: Collection[DependentPair]) -> Names:
+def undetermined_names(held_names: Collection[str], pairs: Collection[DependentPair]) -> Names:
     """Names of parameters that only their priors determine, except those in a pair whose combination the data
     determine.
     """
     paired = {name for pair in pairs for name in (pair.one, pair.other)}
-    return tuple(name for name in held if name not in paired)
+    return tuple(name for name in held_names if name not in paired)

@@ -174,7 +174,7 @@ def judge_adequacy(
         converged: True if the search converged.
     """
     misses = fit.misses(as_stated, ~estimated)
-    adequacy = adequacy_of_residuals(fit, known=not estimated.any())
+    adequacy = adequacy_of_residuals(fit, noise_known=not estimated.any())
     is_compared = fit.counts & np.isfinite(as_stated)
     chi2_as_stated = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=is_compared)
     obstacle = (
@@ -187,20 +187,20 @@ def judge_adequacy(
     return dataclasses.replace(adequacy, adequate=adequate, obstacle=obstacle, misses=misses)
 
 
-def adequacy_of_residuals(fit: Residuals, *, known: bool) -> Adequacy:
+def adequacy_of_residuals(fit: Residuals, *, noise_known: bool) -> Adequacy:
     """Tests if the residuals of a fit are consistent with noise.
 
     Args:
         known: True if the noise of every channel is known and not estimated from the misfit.
     """
     chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
-    tests = structure_tests(fit, known=known)
-    if known and freedom > 0:
+    tests = structure_tests(fit, noise_known=noise_known)
+    if noise_known and freedom > 0:
         tests.append((float(chdtrc(freedom, chi2)), AdequacyFinding(what="stated")))
     if not (strongest := _strongest_test(tests)):
-        return Adequacy(None, chi2, freedom, None, AdequacyFinding(), known)
+        return Adequacy(None, chi2, freedom, None, AdequacyFinding(), noise_known)
     (p, finding) = strongest[0]
-    return Adequacy(p > LEVEL, chi2, freedom, p, finding, known)
+    return Adequacy(p > LEVEL, chi2, freedom, p, finding, noise_known)
 
 
 def _strongest_test(tests: list[tuple[float, AdequacyFinding]]) -> list[tuple[float, AdequacyFinding]]:
@@ -208,16 +208,18 @@ def _strongest_test(tests: list[tuple[float, AdequacyFinding]]) -> list[tuple[fl
     return [(min(1.0, p * len(tests)), finding) for p, finding in sorted(tests)[:1]]
 
 
-def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, AdequacyFinding]]:
+def structure_tests(fit: Residuals, *, noise_known: bool) -> list[tuple[float, AdequacyFinding]]:
     """Tests for structure in the residuals: over the conditions, in time, and against replicates. Each has a p-value
     and a finding.
     """
-    families = {finding: _p_value_of_columns(fit, columns, known) for finding, columns in _curve_columns(fit).items()}
+    families = {
+        finding: _p_value_of_columns(fit, columns, noise_known) for finding, columns in _curve_columns(fit).items()
+    }
     curves = [(p, finding) for finding, p in families.items() if p is not None]
     return [*_strongest_test(curves), *_strongest_test(_autocorrelation_tests(fit)), *_replicate_test(fit)]
 
 
-def _p_value_of_columns(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
+def _p_value_of_columns(fit: Residuals, columns: np.ndarray, noise_known: bool) -> float | None:
     """p-value of the misfit that the columns, shape (readings, terms), explain. None if too few degrees of freedom
     remain.
     """
@@ -233,7 +235,7 @@ def _p_value_of_columns(fit: Residuals, columns: np.ndarray, known: bool) -> flo
     if terms == 0 or freedom - terms < LEAST:
         return None
     explained = float(np.sum((directions.T @ np.concatenate([fit.whitened.ravel(), fit.z])) ** 2))
-    if known:
+    if noise_known:
         return float(chdtrc(terms, explained))
     unexplained = max(float(fit.chi2.sum()) - explained, 1e-12) / (freedom - terms)
     return float(fdtrc(terms, freedom - terms, explained / terms / unexplained))
@@ -350,7 +352,7 @@ def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
     Args:
         level: family-wise significance level of that test.
     """
-    tests = structure_tests(fit.rescaled(), known=False)
+    tests = structure_tests(fit.rescaled(), noise_known=False)
     if tests and min(p for p, _ in tests) * len(tests) < level:
         return {}
     factors = {}

@@ -175,15 +175,15 @@ class HeldCoordinates(eqx.Module):
 
 
 @compiled
-def fit_with_held(problem: Problem, starts: Array, held: Array, max_steps: int = 100) -> Optimum:
+def fit_with_held(problem: Problem, starts: Array, is_held: Array, max_steps: int = 100) -> Optimum:
     """Optimum from each start with some of its coordinates held. Their priors are left out of its cost."""
 
-    def fit(start: Z, held: Array) -> Optimum:
-        coordinates = HeldCoordinates(problem.coordinates, held, start)
-        of_start = problem.with_data(centre=jnp.where(held, start, problem.data.centre))
+    def fit(start: Z, is_held: Array) -> Optimum:
+        coordinates = HeldCoordinates(problem.coordinates, is_held, start)
+        of_start = problem.with_data(centre=jnp.where(is_held, start, problem.data.centre))
         return levenberg_marquardt(dataclasses.replace(of_start, coordinates=coordinates), start, max_steps)[0]
 
-    return jax.vmap(fit)(starts, held)
+    return jax.vmap(fit)(starts, is_held)
 
 
 class SearchMember(eqx.Module):

@@ -35,12 +35,12 @@ class Scan:
     """Misfit over one coordinate.
 
     Attributes:
-        at: scanned values of the coordinate, increasing, shape (points,).
+        values: scanned values of the coordinate, increasing, shape (points,).
         cost: objective at each value, with the other coordinates at their linearised minimum [½σ²], shape (points,).
         others: all coordinates at each value, shape (points, parameters).
     """
 
-    at: Float[np.ndarray, " points"]
+    values: Float[np.ndarray, " points"]
     cost: Float[np.ndarray, " points"]
     others: Float[np.ndarray, "points parameters"]
 
@@ -62,14 +62,16 @@ class Scan:
 
     def _crossing(self, inner: int, side: int) -> float:
         """Coordinate between point k (inside) and the next one at which the rise is 3.84, or the end point."""
-        if not 0 <= inner + side < len(self.at):
-            return float(self.at[inner])
+        if not 0 <= inner + side < len(self.values):
+            return float(self.values[inner])
         inner_root, outer_root = (
             np.sqrt(max(2 * (self.cost[j] - self.cost.min()), 0.0)) for j in (inner, inner + side)
         )
         return float(
-            self.at[inner]
-            + (self.at[inner + side] - self.at[inner]) * (Z95 - inner_root) / max(outer_root - inner_root, 1e-12)
+            self.values[inner]
+            + (self.values[inner + side] - self.values[inner])
+            * (Z95 - inner_root)
+            / max(outer_root - inner_root, 1e-12)
         )
 
     def open(self) -> tuple[bool, bool]:
@@ -82,10 +84,10 @@ class Scan:
 
     def sd(self) -> float:
         """Standard deviation of the coordinate, with exp(-rise / 2) as its density."""
-        width = np.gradient(self.at)
+        width = np.gradient(self.values)
         mass = width * np.exp(self.cost.min() - self.cost)
-        middle = np.sum(mass * self.at) / np.sum(mass)
-        return float(np.sqrt(np.sum(mass * (self.at - middle) ** 2) / np.sum(mass)))
+        middle = np.sum(mass * self.values) / np.sum(mass)
+        return float(np.sqrt(np.sum(mass * (self.values - middle) ** 2) / np.sum(mass)))
 
 
 def wide_coordinates(problem: Problem) -> tuple[int, ...]:
@@ -107,7 +109,7 @@ def scan_coordinate(problem: Problem, z: np.ndarray, k: int) -> Scan:
     """
     count = problem.observe.number_of_scan_points(problem, k)
     scan = _scan_at(problem, z, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
-    minima = np.array([z[k], *scan.at[scan.local_minima()]])[:CLOSER]
+    minima = np.array([z[k], *scan.values[scan.local_minima()]])[:CLOSER]
     points_per_minimum = count // CLOSER
     near_minima = (minima[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, points_per_minimum)).ravel()
     if points_per_minimum > 2:
@@ -121,7 +123,9 @@ def _scan_at(problem: Problem, z: np.ndarray, k: int, values: np.ndarray, before
     values = np.clip(values, -RANGE, RANGE)
     points = values, *map(np.asarray, problem.observe.scan(problem, jnp.asarray(z), k, jnp.asarray(values)))
     if before is not None:
-        points = tuple(np.concatenate(x) for x in zip((before.at, before.cost, before.others), points, strict=True))
+        points = tuple(
+            np.concatenate(x) for x in zip((before.values, before.cost, before.others), points, strict=True)
+        )
     order = np.unique(points[0], return_index=True)[1]
     values, cost, others = (x[order] for x in points)
     return Scan(values, np.where(np.isfinite(cost), cost, np.inf), others)
@@ -134,7 +138,7 @@ def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) ->
     starts = np.array(starts, float)
     for k in problem.observe.scanned(problem):
         scan = scan_coordinate(problem, starts[0], k)
-        starts[:, k] = scan.at[np.argmin(scan.cost)]
+        starts[:, k] = scan.values[np.argmin(scan.cost)]
     return starts
 
 
@@ -168,7 +172,7 @@ def search_lower_minima(
         lower = best
         for k, scan in scans.items():
             for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:
-                start = np.where(np.arange(len(z)) == k, scan.at[j], z)
+                start = np.where(np.arange(len(z)) == k, scan.values[j], z)
                 candidate = search(min((scan.others[j], start), key=objective))
                 lower = min(lower, candidate, key=lambda search_end: float(search_end[0].cost))
         if not float(lower[0].cost) < cost_here - WORTH:

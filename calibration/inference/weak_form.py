@@ -608,7 +608,7 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
         offset = whiten(factors, read_terms) - whiten(factors, (smooth_terms.f, smooth_terms.y))
         cache: dict[bytes, tuple[np.ndarray, tuple[Any, Any]]] = {}
 
-        def at(z: np.ndarray) -> tuple[np.ndarray, tuple[Any, Any]]:
+        def residuals_at(z: np.ndarray) -> tuple[np.ndarray, tuple[Any, Any]]:
             if (key := z.tobytes()) not in cache:
                 terms_at_z = terms(smooth, z)
                 errors = whiten(factors, (terms_at_z.f[..., None], terms_at_z.y[..., None]), terms_at_z.by_z)
@@ -618,21 +618,21 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
                 cache[key] = np.concatenate([errors, priors]), terms_at_z.by_effects
             return cache[key]
 
-        return at, factors, smooth, smooth_terms, read_terms
+        return residuals_at, factors, smooth, smooth_terms, read_terms
 
     z = centre
     try:
         for _ in range(ROUNDS):
             return_memory()  # terms of a long log
             origin = z
-            at, factors, *states = linearise_about(origin)
+            residuals_at, factors, *states = linearise_about(origin)
             regression = least_squares(
-                lambda z: at(z)[0][:, 0], z, lambda z: at(z)[0][:, 1:], method="lm",  # noqa: B023
+                lambda z: residuals_at(z)[0][:, 0], z, lambda z: residuals_at(z)[0][:, 1:], method="lm",  # noqa: B023
                 max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
             )  # fmt: skip
             step = (regression.x - z) * min(1.0, FAR / max(float(np.abs(regression.x - z).max()), 1e-300))
             z = z + step
-            residuals, by_effects = at(z)
+            residuals, by_effects = residuals_at(z)
             if np.abs(residuals[:, 1:] @ step).max() < SETTLED:
                 break
         signatures = whiten(factors, by_effects)

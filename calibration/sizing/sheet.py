@@ -227,7 +227,7 @@ def _quantity_at_points(
     ratings: Ratings,
     names: Names,
     rows: Float[Array, "rows parameters"],
-    at: EnvelopePoint,
+    points: EnvelopePoint,
     name: str,
 ) -> tuple[Array, Array]:
     """Values and outcomes of a quantity for robots (rows of parameters) at points, shape (rows, points)."""
@@ -236,18 +236,18 @@ def _quantity_at_points(
         changed, changed_ratings = _with_parameters(robot, ratings, names, theta)
         return evaluate_requirement(changed, point, changed_ratings, name)
 
-    return jax.vmap(lambda theta: jax.vmap(lambda p: evaluate(theta, p))(at))(rows)
+    return jax.vmap(lambda theta: jax.vmap(lambda p: evaluate(theta, p))(points))(rows)
 
 
 @compiled
 def _quantity_gradient(
-    robot: Robot, ratings: Ratings, names: Names, theta: Array, at: EnvelopePoint, name: str
+    robot: Robot, ratings: Ratings, names: Names, theta: Array, point: EnvelopePoint, name: str
 ) -> Array:
     """Derivative of a quantity at one point with respect to the parameters."""
 
     def value(theta: Array) -> Array:
         changed, changed_ratings = _with_parameters(robot, ratings, names, theta)
-        return evaluate_requirement(changed, at, changed_ratings, name)[0]
+        return evaluate_requirement(changed, point, changed_ratings, name)[0]
 
     return jax.grad(value)(theta)
 
