@@ -9,11 +9,11 @@ from typing import Any
 from calibration.data import Names
 
 
-def describe(subject: Any, part: str = "", *about: str) -> str:
+def describe(found: Any, part: str = "", *about: str) -> str:
     """English sentence of a note or a result, such as a calibration's `remarks` or a result of `discover`.
 
     Args:
-        subject: a remark, a result, or a sentence, which is returned unchanged.
+        found: a remark, a result, or a sentence, which is returned unchanged.
         part: part of a result: `header` of its robot file, or `standing` of the names in the loop. "": its answer.
         about: further arguments of the part: the name of the robot, for a header.
 
@@ -23,21 +23,21 @@ def describe(subject: Any, part: str = "", *about: str) -> str:
     Raises:
         TypeError: there is no sentence for this kind of object or part.
     """
-    if isinstance(subject, str):
-        return subject
+    if isinstance(found, str):
+        return found
     # results and notes are described by methods of their own, so their module cannot be imported above
     word_tables = importlib.import_module("calibration.words.note_words")
-    if isinstance(subject, word_tables.Remark) and not part:
-        sentence = word_tables.NOTES[subject.code]
+    if isinstance(found, word_tables.Remark) and not part:
+        sentence = word_tables.NOTES[found.code]
         if isinstance(sentence, str):
-            values_text = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in subject.values.items()}
+            values_text = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in found.values.items()}
             return sentence.format(**values_text)
-        return sentence(**subject.values)
-    sentence = word_tables.PARTS.get((type(subject), part)) if part else word_tables.RESULTS.get(type(subject))
+        return sentence(**found.values)
+    sentence = word_tables.PARTS.get((type(found), part)) if part else word_tables.RESULTS.get(type(found))
     if sentence is None:
-        kind = type(subject).__name__ + (f", {part}" if part else "")
+        kind = type(found).__name__ + (f", {part}" if part else "")
         raise TypeError(f"describe: got {kind}; expected a note or a result of calibrate, discover or sensitivity")
-    return sentence(subject, *about)
+    return sentence(found, *about)
 
 
 def sentences(notes: Iterable[object]) -> Names:
