@@ -462,7 +462,7 @@ def test_higher_voltage_needs_a_rating_and_is_watched(rover):
 @pytest.mark.slow
 def test_steepest_slope_is_one_that_the_robot_climbs():
     slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
-    does = np.asarray(eqx.filter_jit(foreseen)(slippery, batch_experiments(MENU, channels.USUAL)).does)
+    does = np.asarray(eqx.filter_jit(foreseen)(slippery, batch_experiments(MENU, channels.USUAL)).feasible)
     kept, first = {}, 0
     for run in runs_of(MENU):
         rows = slice(first, first := first + len(run.voltage))

@@ -224,9 +224,7 @@ def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
     space = SimpleNamespace(included=np.ones(6, bool))
     beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear), space=space)
     masks = [np.isin(np.arange(6), rows) for rows in ((0, 4), (1, 2), (3, 5))]
-    np.testing.assert_array_equal(
-        gains_room._within_seen_range(beside, masks), [False, True, True, False, True, False]
-    )
+    np.testing.assert_array_equal(gains_room._rows_in_range(beside, masks), [False, True, True, False, True, False])
 
 
 def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(monkeypatch):

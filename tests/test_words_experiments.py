@@ -125,7 +125,9 @@ def test_every_kind_of_runs_has_words():
 def test_steps_are_those_that_a_person_sets(span, count, step):
     assert menu.step_of_settings(span, count) == pytest.approx(step)
     last = menu.last_setting(span, step)
-    assert last <= span * (1 + menu.ABOUT) < last + step and last / step == pytest.approx(round(last / step))
+    assert last <= span * (1 + menu.SETTING_TOLERANCE) < last + step and last / step == pytest.approx(
+        round(last / step)
+    )
 
 
 @pytest.mark.parametrize("reach", [ONE, BENCH, DRIVEN, BRAKED, HELD])

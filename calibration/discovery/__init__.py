@@ -1,6 +1,6 @@
 """The closed loop: the model error of a fitted robot, traced to a balance and, if one fits, to an effect."""
 
-#: File of the robot as fitted, without effects that were found. It is written as soon as it is known.
+#: File of the fitted robot without the effects that the loop adds. It is written as soon as it is known.
 REFIT_FILE = "fitted.toml"
 
 

@@ -73,7 +73,7 @@ class ActiveSet(eqx.Module):
         p, s = len(self.base), self.slots
         return z[..., :p], z[..., p : p + s], z[..., p + s :]
 
-    def held(self) -> Float[Array, "slots effects"]:
+    def slot_matrix(self) -> Float[Array, "slots effects"]:
         """Matrix with a 1 in each slot's row, in the column of its effect, and zeros elsewhere."""
         return jnp.asarray(self.active[:, None] == jnp.arange(len(self.names)), float)
 
@@ -91,17 +91,19 @@ class ActiveSet(eqx.Module):
 
     def with_effects(self, active: Sequence[int] | Array) -> ActiveSet:
         """Copy with these effects in the slots."""
-        slots = active if isinstance(active, jax.Array) else np.asarray(active, int)  # avoids compiling a conversion
-        return dataclasses.replace(self, active=jnp.asarray(slots, int))
+        indices = (
+            active if isinstance(active, jax.Array) else np.asarray(active, int)
+        )  # avoids compiling a conversion
+        return dataclasses.replace(self, active=jnp.asarray(indices, int))
 
 
 @functools.partial(compiled, options=SELDOM)
 def _scaled_parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
     """Base coordinates, and the amplitude and shape value of each effect."""
     base, amplitude, shape = space.parts(z)
-    held_vector = space.held()
-    amplitudes = space.sd * (amplitude @ held_vector)
-    shapes = shape_parameter_at(space.scales, shape @ held_vector)
+    slot_matrix = space.slot_matrix()
+    amplitudes = space.sd * (amplitude @ slot_matrix)
+    shapes = shape_parameter_at(space.scales, shape @ slot_matrix)
     return base, params.split_numbers(amplitudes), params.split_numbers(shapes)
 
 
@@ -134,9 +136,9 @@ class ScoredLibrary:
 
     def largest(self, instances: np.ndarray) -> np.ndarray:
         """Largest value among the instances of each effect, shape (effects,). Values must not be negative."""
-        largest_scores = np.zeros(len(self))
-        np.maximum.at(largest_scores, self.of, instances)
-        return largest_scores
+        largest = np.zeros(len(self))
+        np.maximum.at(largest, self.of, instances)
+        return largest
 
     def instances(self, name: str) -> np.ndarray:
         """Indices of the instances of an effect."""
@@ -224,8 +226,8 @@ class CandidateSpace:
         sets = [tuple(names) for names in sets]
         problem, coordinates = self.equipped, self.coordinates
         if self.bare.observe.long:
-            placed = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
-            effect_indices = np.flatnonzero(np.isin(self.library.names, list(placed)))
+            included = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
+            effect_indices = np.flatnonzero(np.isin(self.library.names, list(included)))
             scales: Any = tuple(x[effect_indices] for x in coordinates.scales)
             coordinates = dataclasses.replace(
                 coordinates,
@@ -234,8 +236,8 @@ class CandidateSpace:
                 names=tuple(coordinates.names[k] for k in effect_indices),
                 shapes=tuple(coordinates.shapes[k] for k in effect_indices),
             )
-            placed |= {e.name for e in self.bare.base.effects}
-            robot = with_only(problem.base, placed)
+            included |= {e.name for e in self.bare.base.effects}
+            robot = with_only(problem.base, included)
             problem = dataclasses.replace(problem, base=robot, coordinates=coordinates)
         return problem, [coordinates.indices(names) for names in sets]
 
@@ -275,16 +277,16 @@ def candidate_space(bare: Problem, effects: Sequence[Effect], library: Library, 
         tuple(e.name for e in effects),
         tuple("" if s is None else s.name for s in shapes),
     )
-    have = {e.name for e in bare.base.effects}
-    more = tuple(library[e.name]() for e in effects if e.name not in have)
-    robot = params.without_weak_types(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
+    existing = {e.name for e in bare.base.effects}
+    added = tuple(library[e.name]() for e in effects if e.name not in existing)
+    robot = params.without_weak_types(dataclasses.replace(bare.base, effects=(*bare.base.effects, *added)))
     data = dataclasses.replace(bare.data, centre=jnp.pad(bare.data.centre, (0, 2 * slots)))
     grids = tuple(with_shape_grid(e) for e in effects)
-    effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
+    effect_index = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
     return CandidateSpace(
         bare,
         Problem(robot, coordinates, bare.observe, data),
-        ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids])),
+        ScoredLibrary(tuple(effects), grids, effect_index, np.concatenate([s.at for s in grids])),
         settings,
     )
 
@@ -302,8 +304,8 @@ def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear
     problem = space.bare if size == space.free else space.equipped
     informed = jacobian[informative_residuals(problem.data)]
     covariance = np.linalg.inv(informed.T @ informed)
-    parts, kept_places = coordinate_groups(problem.coordinates, space, active, np.asarray(z)[:size])
-    return join_posteriors(parts, covariance[np.ix_(kept_places, kept_places)])
+    parts, used = coordinate_groups(problem.coordinates, space, active, np.asarray(z)[:size])
+    return join_posteriors(parts, covariance[np.ix_(used, used)])
 
 
 def coordinate_groups(

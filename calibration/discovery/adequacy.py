@@ -47,18 +47,18 @@ class AdequacyTest:
         """True if a statistic exceeds its critical value by its margin, so that the fit is certainly incomplete."""
         return any(map(self.exceeds_margin, self.settings.shares))
 
-    def exceeds_margin(self, kind: str, found: float | None = None) -> bool:
-        """True if a statistic exceeds its critical value by its margin. With `found` = None, the statistic of the
+    def exceeds_margin(self, kind: str, value: float | None = None) -> bool:
+        """True if a statistic exceeds its critical value by its margin. With `value` = None, the statistic of the
         data is tested.
         """
         if kind not in self.settings.shares:
             return False
-        statistic = float(getattr(self.found, kind)) if found is None else found
+        statistic = float(getattr(self.found, kind)) if value is None else value
         return statistic > self.threshold(kind) + self.settings.margins[kind]
 
-    def of(self, found: StrongestStatistics) -> AdequacyTest:
+    def of(self, statistics: StrongestStatistics) -> AdequacyTest:
         """The same test of other statistics."""
-        return dataclasses.replace(self, found=found)
+        return dataclasses.replace(self, found=statistics)
 
     def confirmed(self, gain: float) -> AdequacyTest:
         """The test after a simulation: the scores of the strongest effect and of its pairs are reduced to the gain

@@ -32,36 +32,38 @@ from calibration.inference.simulation_errors import channel_errors
 from mmrjax.model import channels, params
 
 
-def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> result.DiscoveryResult:
+def assemble_result(inputs: loop_input.LoopInput, traced: verdict.LoopStages) -> result.DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
-    runs, settings, numbers, run = given.runs, given.settings, given.numbers, traced.run
+    runs, settings, numbers, run = inputs.runs, inputs.settings, inputs.numbers, traced.run
     screened, left, alike, where = traced.screened, traced.left, traced.alike, traced.where
     table, nameless = screened.base.space, traced.verdict in WITHOUT_NAME
     # The fits without and with the proposal. For a log, those of its simulation.
     space, base, best, predicted = table, screened.base.candidate, traced.best, traced.predicted
     noise, before, after, is_added = traced.sds.noise, left, traced.ends, best is not base
     if run is not None:
-        noise = noise if table.bare.observe.reads else given.noise
+        noise = noise if table.bare.observe.reads else inputs.noise
         space, base, best, predicted = run.space, run.base, run.best if is_added else run.base, {}
         before, after = run.diagnosis(base, left), run.diagnosis(best, after)
     observe, included = space.bare.observe, space.included[: len(runs)]
     kind, kinds = type(observe), blocks_room.predictable_blocks(runs, space.bare)
-    first, last = prediction.FittedProblem(*space.fit_of(base.active, base.z)), None
+    refit_problem, proposal_problem = prediction.FittedProblem(*space.fit_of(base.active, base.z)), None
     known_first, known_last = (predicted.get(prediction.candidate_key(c)) for c in (base, best))
-    curve, z, sd, cost, decided_cost = None, best.z, best.sd, best.cost, traced.best.cost
+    curve, z, sd, cost, claimed_cost = None, best.z, best.sd, best.cost, traced.best.cost
     beside = traced.beside if nameless and run is None else None
     if beside is not None:
-        given.progress(fit_notes.progress_remark("shape"))
+        inputs.progress(fit_notes.progress_remark("shape"))
     if is_added:
-        last = prediction.FittedProblem(*space.fit_of(best.active, best.z))
+        proposal_problem = prediction.FittedProblem(*space.fit_of(best.active, best.z))
     elif beside is not None:  # no effect is added, but a curve
         curve, after = beside.fitted, beside.diagnosis
         z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
-        last, known_last, decided_cost = prediction.FittedProblem(curve.problem, z, None), None, cost
-    given.progress(fit_notes.progress_remark("errors"))
-    readings = prediction.readings_of_rows(runs, noise.sd, kinds, first, last, known_first, known_last)
+        proposal_problem, known_last, claimed_cost = prediction.FittedProblem(curve.problem, z, None), None, cost
+    inputs.progress(fit_notes.progress_remark("errors"))
+    readings = prediction.readings_of_rows(
+        runs, noise.sd, kinds, refit_problem, proposal_problem, known_first, known_last
+    )
     gains = _hold_out_gains(space, runs, predicted, traced.best.effects, readings)
-    gain = gains[-1][1] if gains and last is not None else None
+    gain = gains[-1][1] if gains and proposal_problem is not None else None
     # What is written never predicts worse than the refit. A curve, which claims no cause, has to predict better.
     written = gain is None or (gain.mean >= -prediction.WORSE if is_added else gain.mean > gain.se)
     if written and curve is not None:
@@ -70,11 +72,11 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         fit, diagnosis = (best, after) if written else (base, before)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = active_set.posterior_of_fit(space, fit.active, fit.z, diagnosis.linear)
-    given.progress(fit_notes.progress_remark("next"))
+    inputs.progress(fit_notes.progress_remark("next"))
     # What the loop claims: effects or an unnamed discrepancy, and what may be present in addition or instead.
-    decided = dataclasses.replace(best, cost=traced.best.cost)
+    claimed = dataclasses.replace(best, cost=traced.best.cost)
     effects = (
-        () if alike is None else findings.found_effects(table, screened.base.candidate, decided, alike, left.test)
+        () if alike is None else findings.found_effects(table, screened.base.candidate, claimed, alike, left.test)
     )
     hidden: tuple[findings.HiddenEffect, ...] = ()
     if alike is not None and not nameless and run is None:
@@ -85,12 +87,12 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         p_value, simulated = left.test.p_value, run is not None
         unnamed = findings.unnamed_discrepancy(traced.beside, where, p_value, len(runs), simulated)
     ladder = () if traced.searched is None else (alike or traced.searched).ladder
-    near, too_large = findings.listed_alternatives(table, traced.best, decided_cost, ladder)
+    plausible, implausible = findings.listed_alternatives(table, traced.best, claimed_cost, ladder)
     scores, both_ways = findings.effect_scores(table, left.scores), goes_both_ways(runs)
-    summary, library = verdict.verdict_summary(traced, numbers), sorted(given.library.items())
+    summary, library = verdict.verdict_summary(traced, numbers), sorted(inputs.library.items())
     remaining = candidates.residuals_by_channel(space, runs, after.linear, readings.after, z)
     with np.errstate(invalid="ignore"):
-        share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
+        relative_sd = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
 
     errors = functools.partial(errors_on_common_rows, space.bare.channels, readings, included)
     held_out = {word: errors(*x) for word, x in readings.held_out.items()}
@@ -115,8 +117,8 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         cannot_see=findings.invisible_effects(table, left.scores, scores),
         needs_histories=tuple(name for name, e in library if e.transient and not kind.shows(e)),
         needs_reverse=tuple(name for name, e in library if e.needs_reverse and not both_ways),
-        alternatives=near,
-        implausible=too_large,
+        alternatives=plausible,
+        implausible=implausible,
         hidden=hidden,
         support=summary.support,
         cluster=screened.cluster,
@@ -135,7 +137,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
         held_out_worse=worse_predictions(held_out),
         noise={
-            name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
+            name: {"source": noise.source[k], "median_percent": float(np.nanmedian(relative_sd[:, k]))}
             for k, name in enumerate(channels.channel_names(noise.channels))
             if noise.source[k] != "no readings"
         },
@@ -146,11 +148,16 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
 
 
 def errors_on_common_rows(
-    shown: Sequence[channels.Channel], readings: prediction.ReadingsOfRows, included: np.ndarray, *fits: np.ndarray
+    measured_channels: Sequence[channels.Channel],
+    readings: prediction.ReadingsOfRows,
+    included: np.ndarray,
+    *fits: np.ndarray,
 ) -> tuple[result.Errors, ...]:
     """Errors of fits by channel, over the included readings that all of them predict."""
     common = included[:, None] & np.isfinite(fits).all(0)
-    return tuple(channel_errors(shown, np.where(common, x, np.nan), readings.measured, readings.sd) for x in fits)
+    return tuple(
+        channel_errors(measured_channels, np.where(common, x, np.nan), readings.measured, readings.sd) for x in fits
+    )
 
 
 #: Least relative difference of hold-out errors that counts; less is invisible in two digits.
@@ -176,20 +183,20 @@ def _hold_out_gains(
     runs: Runs,
     predicted: prediction.Predicted,
     proposed: Names,
-    seen: prediction.ReadingsOfRows,
+    readings: prediction.ReadingsOfRows,
 ) -> tuple[tuple[Names, prediction.Gain], ...]:
     """Hold-out gain of each set of effects over the refit, ordered by the number of effects. The proposal is last.
 
     Empty if no block can be held out.
     """
-    if not seen.held_out:
+    if not readings.held_out:
         return ()
-    refit, proposal = ({k: x[when] for k, x in seen.held_out.items()} for when in (0, 1))
+    refit, proposal = ({k: x[when] for k, x in readings.held_out.items()} for when in (0, 1))
     by_set = {tuple(filter(None, active)): reading for (active, _), reading in predicted.items()}
     sets = sorted((names for names in by_set if names and names != proposed), key=len)
-    counts, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable_blocks(runs, space.bare)
+    included, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable_blocks(runs, space.bare)
     score = functools.partial(
-        prediction.score_readings, measured=seen.measured, sd=seen.sd, counts=counts, kinds=kinds
+        prediction.score_readings, measured=readings.measured, sd=readings.sd, included=included, kinds=kinds
     )
     before, scored = score(refit), [*((names, by_set[names]) for names in sets), (proposed, proposal)]
     return tuple((names, score(reading).gain(before)) for names, reading in scored)
@@ -216,13 +223,13 @@ def posterior_of_curve(
     """
     shaped: discrepancy.CurveCoordinates = curve.problem.coordinates
     inner = len(shaped.base)
-    turn = np.eye(len(shaped))
-    turn[inner:, inner:] = np.asarray(shaped.root)
-    base, kept_places = active_set.coordinate_groups(shaped.base, space, active, curve.z[:inner])
+    transform = np.eye(len(shaped))
+    transform[inner:, inner:] = np.asarray(shaped.root)
+    base, used = active_set.coordinate_groups(shaped.base, space, active, curve.z[:inner])
     spec = {p.name: p.spec for p in params.walk_parameters(curve.problem.base)}
     ordinates = active_set.clipped_parameters(
         shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:]
     )
-    places = [*kept_places, *range(inner, len(shaped))]
-    covariance = (turn @ curve.covariance @ turn.T)[np.ix_(places, places)]
+    places = [*used, *range(inner, len(shaped))]
+    covariance = (transform @ curve.covariance @ transform.T)[np.ix_(places, places)]
     return posterior_file.join_posteriors([*base, ordinates], covariance)

@@ -155,14 +155,14 @@ def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum) -> Can
         bound = max(spec.bounds[1] if amplitude > 0 else -spec.bounds[0], 0.0) / spec.prior_sd(0.0)
         return abs(amplitude) / max(min(settings.plausible, bound), 1e-9)
 
-    size, near = (np.array(list(map(relative_to_plausible, active, x))) for x in (amplitude, spread))
+    size, relative_sd = (np.array(list(map(relative_to_plausible, active, x))) for x in (amplitude, spread))
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
     z, sd = np.asarray(best.z), np.asarray(best.sd)
     supplies = supplying_effects(space, active, amplitude, z) if np.isfinite(cost) else ()
-    # An amplitude within an sd of a bound is held by it, unless its sd is as large as the whole plausible range.
-    ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and not supplies
+    # The bound determines an amplitude within an sd of it, unless the sd is a quarter of the plausible range or more.
+    plausible = bool(np.all(size + np.where(relative_sd < 0.25, relative_sd, 0.0) < 1.0)) and not supplies
     nearly = bool(np.all(size < settings.stretched)) and not supplies
-    return Candidate(active, z, sd, cost, amplitude, size, ok, nearly, bool(best.converged), supplies)
+    return Candidate(active, z, sd, cost, amplitude, size, plausible, nearly, bool(best.converged), supplies)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,13 +190,13 @@ def with_slots(best: Optimum, space: CandidateSpace) -> Optimum:
     return dataclasses.replace(best, **fit)
 
 
-def fit_base(space: CandidateSpace, where: str, near: Candidate | None = None) -> BaseFit:
+def fit_base(space: CandidateSpace, source: str, near: Candidate | None = None) -> BaseFit:
     """Fits the base without effects, from its prior mean and from random draws of its prior.
 
     If the robot cannot reach some rows at all, they are excluded and the fit is repeated.
 
     Args:
-        where: first words of the error message.
+        source: first words of the error message.
         near: fit of the same runs with other weights, or by regression. For long runs it is the only start,
             unless a regression ends `UNLIKELY` far from its prior.
 
@@ -220,7 +220,7 @@ def fit_base(space: CandidateSpace, where: str, near: Candidate | None = None) -
         space = space.without(unusable_rows)
         if space.included.sum() < FEWEST:
             rows = ", ".join(str(r + 1) for r in unusable[:12])
-            raise BadData(f"{where}: too few rows for a search, since the model has no result in rows {rows}")
+            raise BadData(f"{source}: too few rows for a search, since the model has no result in rows {rows}")
 
 
 def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
@@ -277,7 +277,9 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal]) -> list
     ]
 
 
-def fit_in_addition(space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, ScoreTable]]) -> list[Candidate]:
+def fit_in_addition(
+    space: CandidateSpace, extensions: Sequence[tuple[Names, Candidate, ScoreTable]]
+) -> list[Candidate]:
     """Fits effects in addition to those of a previous fit. Their scores give the start.
 
     A result that is worse than the previous fit started where no solution exists. It is repeated from the previous
@@ -285,15 +287,17 @@ def fit_in_addition(space: CandidateSpace, wanted: Sequence[tuple[Names, Candida
     astray.
 
     Args:
-        wanted: (active effects, previous fit, scores of its residuals). The active effects include those of the
+        extensions: (active effects, previous fit, scores of its residuals). The active effects include those of the
             previous fit.
     """
-    fits = fit_candidates(space, [(w, start_of_fit(space, base_fit, w, scores)) for w, base_fit, scores in wanted])
-    stuck = [k for k, (_, base_fit, _) in enumerate(wanted) if not fits[k].cost <= base_fit.cost + STUCK]
-    restarts = [(k, start_of_fit(space, wanted[k][1], wanted[k][0])) for k in stuck]
+    fits = fit_candidates(
+        space, [(active, start_of_fit(space, base_fit, active, scores)) for active, base_fit, scores in extensions]
+    )
+    stuck = [k for k, (_, base_fit, _) in enumerate(extensions) if not fits[k].cost <= base_fit.cost + STUCK]
+    restarts = [(k, start_of_fit(space, extensions[k][1], extensions[k][0])) for k in stuck]
     for k in sorted(range(len(fits)), key=lambda k: fits[k].cost)[:1]:
         restarts.append((k, np.where(np.arange(len(fits[k].z)) < space.free, 0.0, fits[k].z)))
-    refits = fit_candidates(space, [(wanted[k][0], z) for k, z in restarts])
+    refits = fit_candidates(space, [(extensions[k][0], z) for k, z in restarts])
     for (k, _), refit in zip(restarts, refits, strict=True):
         fits[k] = refit if refit.cost < fits[k].cost - STUCK else fits[k]
     return fits
@@ -301,7 +305,7 @@ def fit_in_addition(space: CandidateSpace, wanted: Sequence[tuple[Names, Candida
 
 def start_of_fit(
     space: CandidateSpace,
-    at: Candidate,
+    previous: Candidate,
     active: Names,
     scores: ScoreTable | None = None,
 ) -> np.ndarray:
@@ -310,15 +314,15 @@ def start_of_fit(
     """
     p, s = space.free, space.settings.slots
     z = np.zeros(p + 2 * s)
-    z[:p] = at.z[:p]
+    z[:p] = previous.z[:p]
     for slot, name in enumerate(active):
-        if name and name in at.active:
-            old = at.active.index(name)
-            z[p + slot], z[p + s + slot] = at.z[p + old], at.z[p + s + old]
+        if name and name in previous.active:
+            old_slot = previous.active.index(name)
+            z[p + slot], z[p + s + slot] = previous.z[p + old_slot], previous.z[p + s + old_slot]
         elif name and scores is not None:
-            m = space.library.best_instance(name, np.asarray(scores.single))
-            z[p + slot] = np.clip(float(scores.amplitude[m]) / space.settings.width, -1.5, 1.5)
-            z[p + s + slot] = space.library.at[m]
+            instance = space.library.best_instance(name, np.asarray(scores.single))
+            z[p + slot] = np.clip(float(scores.amplitude[instance]) / space.settings.width, -1.5, 1.5)
+            z[p + s + slot] = space.library.at[instance]
     return z
 
 

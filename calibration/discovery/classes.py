@@ -55,45 +55,49 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
     Args:
         jacobian, residual: Jacobian and residual of a fit, with the residuals of the priors last.
     """
-    fit, priors = Projection(jacobian, residual), slice(len(residual) - jacobian.shape[1], None)
+    fit = Projection(jacobian, residual)
+    priors = slice(len(residual) - jacobian.shape[1], None)
     leverage = np.sum(fit.half[:, priors] ** 2, 0)
-    free, is_visible = np.maximum(1 - leverage, 1e-9), leverage < 1 - 1e-6
+    free = np.maximum(1 - leverage, 1e-9)
+    is_visible = leverage < 1 - 1e-6
     return np.where(is_visible, fit.left[priors] ** 2 / free, 0.0), np.where(is_visible, residual[priors] / free, 0.0)
 
 
 def find_prior_shifts(
-    space: CandidateSpace, at: Candidate, needed: float, linear: Linearization | None = None
+    space: CandidateSpace, original: Candidate, least_gain: float, linear: Linearization | None = None
 ) -> list[Shift]:
-    """Base parameters that reduce the χ² of a fit by at least `needed` [σ²] if their prior is dropped.
+    """Base parameters that reduce the χ² of a fit by at least `least_gain` [σ²] if their prior is dropped.
 
     Args:
-        at: the fit. Its effects remain in the model.
+        original: the fit. Its effects remain in the model.
         linear: linearization of that fit, if known.
     """
     if linear is None:
-        problem, (active,) = space.problem_for_sets([at.active])
-        residual, jacobian, _ = problem.observe.at(problem, at.z, active)
+        problem, (active,) = space.problem_for_sets([original.active])
+        residual, jacobian, _ = problem.observe.at(problem, original.z, active)
     else:
         residual, jacobian = linear.residual, linear.jacobian
     explained, values = prior_shift_scores(np.asarray(jacobian), np.asarray(residual))
-    shifts, base, p = [], space.coordinates.base, space.free
+    base, p = space.coordinates.base, space.free
+    shifts = []
     for k in np.argsort(-explained[:p]):
-        if explained[k] < needed:
+        if explained[k] < least_gain:
             break
-        fit = _fit_without_prior(space, at, int(k), float(values[k]))
-        if fit is not None:
-            value, stated = (float(base.value(np.asarray(z))[k]) for z in (fit.z[:p], np.zeros(p)))
-            shifts.append(Shift(base.names[k], value, stated, base.units[k], float(fit.z[k]), fit))
+        shifted = _fit_without_prior(space, original, int(k), float(values[k]))
+        if shifted is not None:
+            value, stated = (float(base.value(np.asarray(z))[k]) for z in (shifted.z[:p], np.zeros(p)))
+            shifts.append(Shift(base.names[k], value, stated, base.units[k], float(shifted.z[k]), shifted))
     return shifts
 
 
-def _fit_without_prior(space: CandidateSpace, at: Candidate, k: int, value: float) -> Candidate | None:
+def _fit_without_prior(space: CandidateSpace, original: Candidate, k: int, value: float) -> Candidate | None:
     """Fit without the prior of coordinate k: the mean of the prior is moved to the estimate from the data.
 
     None if the estimate is outside the bounds of the parameter, or if the fit does not converge.
     """
-    p, mean, start = space.free, value, np.array(at.z)
-    equipped, (indices,) = space.problem_for_sets([at.active])
+    p, mean = space.free, value
+    start = np.array(original.z)
+    equipped, (indices,) = space.problem_for_sets([original.active])
     for _ in range(ROUNDS):
         centre = np.zeros(len(start))
         centre[k] = mean
@@ -109,7 +113,7 @@ def _fit_without_prior(space: CandidateSpace, at: Candidate, k: int, value: floa
         mean, start = float(z[k]), z.copy()
     if space.coordinates.base.beyond(z[:p])[k]:
         return None
-    return candidate_of_fit(space, at.active, best)
+    return candidate_of_fit(space, original.active, best)
 
 
 # --- classes --------------------------------------------------------------------------------------
@@ -146,52 +150,53 @@ class Classes:
         ]
 
 
-def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ...], after: Diagnosis) -> Classes:
+def find_classes(base_curve: BaseCurve, best: Candidate, ladder: tuple[Candidate, ...], after: Diagnosis) -> Classes:
     """Effects and stated values that explain the data as well as each effect of the best fit.
 
     Real losses need not have the exact form of a library effect. So an alternative may explain less than the effect
     by a share `settings.form` of its sigmas, or by `form_family` if it is of the same family.
 
     Args:
-        beside: the base fit with its diagnosis.
+        base_curve: the base fit with its diagnosis.
         after: diagnosis of the best fit.
     """
-    space, left, settings = beside.space, beside.left, beside.settings
+    space, left, settings = base_curve.space, base_curve.left, base_curve.settings
     names, effect_of = space.library.names, space.library.of
     # Largest |cos| between the projected signatures of every two effects, over their shapes.
     cosine = np.zeros((len(names), len(names)))
     np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(left.scores.cosine))
-    one = len(best.effects) == 1
-    fewer = [beside.base] if one else refit_without_each(space, best, ladder)
+    is_single = len(best.effects) == 1
+    without_each = [base_curve.base] if is_single else refit_without_each(space, best, ladder)
     rivals: dict[tuple[str, str], Names] = {}
     for name in best.effects:
-        parallel = cosine[names.index(name)]
-        for j in np.argsort(-parallel)[:TRIED]:
-            if parallel[j] > settings.alike and names[j] not in best.effects:
+        cosines = cosine[names.index(name)]
+        for j in np.argsort(-cosines)[:TRIED]:
+            if cosines[j] > settings.alike and names[j] not in best.effects:
                 rivals[name, names[j]] = best.with_effect(name, names[j])
     fits = {c.key: c for c in ladder}
-    new = [active for active in rivals.values() if frozenset(active) - {""} not in fits]
-    fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, left.scores)) for w in new])
+    untried = [active for active in rivals.values() if frozenset(active) - {""} not in fits]
+    fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, left.scores)) for w in untried])
     fits |= {c.key: c for c in fitted}
     members, shift_lists, families = [], [], []
-    for name, without in zip(best.effects, fewer, strict=True):
-        same, gain = [name], 2 * (without.cost - best.cost)
+    for name, without in zip(best.effects, without_each, strict=True):
+        equivalent = [name]
+        gain = 2 * (without.cost - best.cost)
         family = space.library[name].family()
         for (replaced, other), active in rivals.items():
             rival = fits[frozenset(active) - {""}]
-            akin = space.library[other].family() == family
-            limit = settings.tolerance(gain, akin)
+            same_family = space.library[other].family() == family
+            limit = settings.tolerance(gain, same_family)
             if cosine[names.index(name), names.index(other)] > settings.parallel:
                 limit = max(limit, settings.same_parallel)
-            plausible = rival.nearly if akin else rival.plausible
+            plausible = rival.nearly if same_family else rival.plausible
             if replaced == name and plausible and 2 * (rival.cost - best.cost) <= limit:
-                same.append(other)
-        members.append(tuple(same))
+                equivalent.append(other)
+        members.append(tuple(equivalent))
         fit = Projection.of(after.linear)
         column = fit.jacobian[: after.linear.readings, space.free + best.active.index(name), None]
         ammeter = ammeter_families(space, remove_effect(space, best, name, fit), column, family, settings)
-        families.append(tuple(dict.fromkeys((*(space.library[m].family() for m in same), *ammeter))))
-        shifts = find_prior_shifts(space, without, SURE * gain, left.linear if one else None)
+        families.append(tuple(dict.fromkeys((*(space.library[m].family() for m in equivalent), *ammeter))))
+        shifts = find_prior_shifts(space, without, SURE * gain, left.linear if is_single else None)
         shift_lists.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
     return Classes(tuple(members), tuple(shift_lists), tuple(families), (*ladder, *fitted))
 
@@ -219,8 +224,9 @@ def ammeter_families(
     """
     if space.bare.base.rig.imposed != "motor_speed":
         return ()
-    names, most = channels.channel_names(space.bare.channels), fit.explained(columns)[0]
-    least = most - settings.tolerance(most)
+    names = channels.channel_names(space.bare.channels)
+    explained, _ = fit.explained(columns)
+    least = explained - settings.tolerance(explained)
     driver = family.partition(" that ")[2].replace("with load", "with current")
     of_channel = np.arange(len(columns)) % len(names)
     return tuple(

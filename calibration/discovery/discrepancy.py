@@ -67,34 +67,36 @@ def locate_discrepancy(left: Diagnosis, bases: bases_room.Bases, included: np.nd
     """
     names = bases_room.family_names(bases)
     deviate, explained = np.asarray(left.scores.curve), np.asarray(left.scores.explained)
-    happens = np.array([bases_room.window_from_name(n[1]) is not None for n in names])
+    is_window = np.array([bases_room.window_from_name(n[1]) is not None for n in names])
     # A smooth curve responds to a temporary change too, and a window to a smooth curve.
-    for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
-    same_kind = [j for j in range(len(names)) if happens[j] == for_a_while]
+    is_temporary = bool(np.max(deviate[is_window], initial=-np.inf) > np.max(deviate[~is_window]) + ALIKE)
+    same_kind = [j for j in range(len(names)) if is_window[j] == is_temporary]
     k = max(same_kind, key=deviate.__getitem__)
     # A balance takes precedence over an instrument with a similar score, which is listed as an alternative.
-    lacks = [j for j in same_kind if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
-    k = max(lacks, key=deviate.__getitem__) if lacks else k
+    near_balances = [
+        j for j in same_kind if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE
+    ]
+    k = max(near_balances, key=deviate.__getitem__) if near_balances else k
     place = names[k][0]
     place_columns = [j for j in same_kind if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
-    j = k if for_a_while else max(place_columns, key=deviate.__getitem__)
+    j = k if is_temporary else max(place_columns, key=deviate.__getitem__)
     if names[j][1] in bases_room.VARIABLES:
-        smoothly = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
+        curves = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
         # A voltage acts on torques and slip only through currents and speeds, so it may be listed but never leads.
-        direct = [i for i in smoothly if place not in MECHANICAL or names[i][1] != "voltage"]
-        evidence = {i: smooth.fit_smooth_curve(left.linear, *names[i], included).evidence for i in direct or smoothly}
+        direct = [i for i in curves if place not in MECHANICAL or names[i][1] != "voltage"]
+        evidence = {i: smooth.fit_smooth_curve(left.linear, *names[i], included).evidence for i in direct or curves}
         j = max(evidence, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in same_kind)
     best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
     variable, strength = names[j][1], float(explained[j])
-    alike = _places_of_same_response(left.linear, [b for b, d in best.items() if d > deviate[k] - ALIKE])
-    happening = bases_room.window_from_name(variable)
-    if happening is not None and happening.axis in bases_room.AXES:
-        happening, strength = refine_window(left.linear, place, happening.axis, included)
-        variable = str(happening)
+    alike = _places_of_same_response(left.linear, [b for b, score in best.items() if score > deviate[k] - ALIKE])
+    window = bases_room.window_from_name(variable)
+    if window is not None and window.axis in bases_room.AXES:
+        window, strength = refine_window(left.linear, place, window.axis, included)
+        variable = str(window)
     strongest = max(strength, float(explained[k]))
-    also = similar_variables(names, deviate, place, variable)
-    return DiscrepancyLocation(place, variable, alike, also, strength, strongest)
+    similar = similar_variables(names, deviate, place, variable)
+    return DiscrepancyLocation(place, variable, alike, similar, strength, strongest)
 
 
 def _places_of_same_response(linear: Linearization, similar: Sequence[str]) -> Names:
@@ -106,8 +108,8 @@ def _places_of_same_response(linear: Linearization, similar: Sequence[str]) -> N
     without_curves, errors = tuple(itertools.chain(*bases_room.STANDS_FOR.values())), np.ones((linear.points, 1))
     responses = np.stack([bases_room.place_signature(linear, p, errors)[:, 0] for p in (*similar, *without_curves)])
     responses /= np.maximum(np.linalg.norm(responses, axis=1, keepdims=True), 1e-300)
-    alike = np.abs(responses[: len(similar)] @ responses[len(similar) :].T) > PARALLEL
-    pairs = zip(similar, alike, strict=True)
+    same_response = np.abs(responses[: len(similar)] @ responses[len(similar) :].T) > PARALLEL
+    pairs = zip(similar, same_response, strict=True)
     return tuple(itertools.chain(*((p, *itertools.compress(without_curves, row)) for p, row in pairs)))
 
 
@@ -116,16 +118,16 @@ def similar_variables(names: Sequence[tuple[str, str]], deviate: np.ndarray, pla
     by_variable = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
     by_variable.pop(bases_room.CONDITIONS, None)
     variable_of_axis: dict[str, str] = {_window_axis(variable): variable}
-    for other, d in by_variable.items():
-        if d > max(by_variable.values()) - ALIKE:
+    for other, score in by_variable.items():
+        if score > max(by_variable.values()) - ALIKE:
             variable_of_axis.setdefault(_window_axis(other), other)
     return tuple(other for other in variable_of_axis.values() if other != variable)
 
 
 def _window_axis(variable: str) -> str:
     """Key shared by all windows of one axis. A smooth curve has a key of its own."""
-    happens = bases_room.window_from_name(variable)
-    return variable if happens is None else f"{happens.axis} for a while"
+    window = bases_room.window_from_name(variable)
+    return variable if window is None else f"{window.axis} for a while"
 
 
 def refine_window(
@@ -150,9 +152,9 @@ def refine_window(
     first, last = np.triu_indices(len(edges) + 1, 1)
     norm2 = sums[last, last] - 2 * sums[first, last] + sums[first, first]
     rows_in_window = rows[last] - rows[first]
-    fair = (rows_in_window >= bases_room.FEWEST) & (rows_in_window <= 0.5 * rows[-1])
-    fair &= norm2 > 1e-9 * max(float(a.max()), 1e-300)
-    gain = np.where(fair, (pull[last] - pull[first]) ** 2 / np.where(fair, norm2, 1.0), -np.inf)
+    allowed = (rows_in_window >= bases_room.FEWEST) & (rows_in_window <= 0.5 * rows[-1])
+    allowed &= norm2 > 1e-9 * max(float(a.max()), 1e-300)
+    gain = np.where(allowed, (pull[last] - pull[first]) ** 2 / np.where(allowed, norm2, 1.0), -np.inf)
     k = int(np.argmax(gain))
     inside = included & (index >= first[k]) & (index < last[k])
     return bases_room.Window(axis, float(x[inside].min()), float(x[inside].max())), float(gain[k])
@@ -254,14 +256,14 @@ def fit_curve(space: CandidateSpace, base: Candidate, at_base: smooth.SmoothCurv
         coordinates=shaped,
         data=dataclasses.replace(bare.data, centre=jnp.zeros(len(shaped))),
     )
-    inner = len(bare.coordinates)
+    base_size = len(bare.coordinates)
     starts = np.zeros((STARTS, len(shaped)))
-    starts[:, :inner] = base.z[:inner]
-    starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
+    starts[:, :base_size] = base.z[:base_size]
+    starts[:, base_size:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
     optima, observations = fit_from_each_start(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
     z, covariance = np.asarray(optima.z[k]), np.asarray(optima.covariance[k])
-    grid, curve, sd = at_base.drawn(z[inner:], covariance[inner:, inner:])
+    grid, curve, sd = at_base.drawn(z[base_size:], covariance[base_size:, base_size:])
     robot = problem.robot(jnp.asarray(z))  # also has the absent effects of the slots
     return FittedCurve(
         robot=with_only(robot, {*(e.name for e in space.bare.base.effects), *base.effects, at_base.effect}),

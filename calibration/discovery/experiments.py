@@ -4,11 +4,11 @@ Alternatives are hypotheses that explain the same table equally well. Each predi
 with the covariance S = diag(sd²) + J C Jᵀ. The first term is the variance of the instruments. The second is, to first
 order, the covariance of the fitted coordinates. C = (JᵀJ)⁻¹ is over readings and priors of the table (Chaloner and
 Verdinelli, Bayesian experimental design, Statistical Science 10 (1995)). The separation of two alternatives A, B is
-√(dᵀ S⁻¹ d), d = y_A - y_B. Of S for A and S for B, the one with the smaller separation is used (Hunter and Reiner,
-Designs for discriminating between two rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the
-other is larger by σ² ± 2σ, where σ is their separation. So the probability that the false one is refuted is Φ((σ² -
-refuted) / 2σ). The proposal is expected to separate most of all pairs. If one experiment is not enough, two are
-proposed.
+√(dᵀ S⁻¹ d), d = y_A - y_B. S is the covariance of A or of B, whichever gives the smaller separation (Hunter and
+Reiner, Designs for discriminating between two rival models, Technometrics 7 (1965)). If one of them is true, the χ²
+of the other is larger by σ² ± 2σ, where σ is their separation. So the probability that the false one is refuted is
+Φ((σ² - refuted) / 2σ). The proposal is expected to separate most of all pairs. If one experiment is not enough, two
+are proposed.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class RankedExperiment:
         return min(self.sigma, default=0.0)
 
     @property
-    def told(self) -> tuple[float, ...]:
+    def sufficient(self) -> tuple[float, ...]:
         """Separations that are large enough to justify the experiment [σ]."""
         return tuple(s for s in self.sigma if s >= self.settings.worth)
 
@@ -169,18 +169,18 @@ class Proposal:
 # --- alternatives -----------------------------------------------------------------------------------
 
 
-def alternatives_of_class(best: Candidate, found: Classes) -> dict[str, Candidate]:
+def alternatives_of_class(best: Candidate, found_classes: Classes) -> dict[str, Candidate]:
     """Candidates that the data cannot separate, by the names of their effects, and of stated values that may be wrong
     in place of one. The best fit is first.
     """
-    fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
+    fitted = {c.key: c for c in sorted(found_classes.ladder, key=lambda c: -c.cost)}
     alternatives = {best.active: best}
-    for leader, *others in found.members:
+    for leader, *others in found_classes.members:
         for name in others:
             active = best.with_effect(leader, name)
             alternatives[active] = fitted[frozenset(active) - {""}]
     by_name = {" + ".join(c.effects): c for c in alternatives.values()}
-    for shifts in found.stated:
+    for shifts in found_classes.stated:
         by_name |= {" + ".join((s.name, *s.fit.effects)): s.fit for s in shifts}
     return by_name
 
@@ -191,7 +191,7 @@ def alternatives_of_class(best: Candidate, found: Classes) -> dict[str, Candidat
 @functools.partial(compiled, options=SELDOM)
 def _predict_alternatives(
     problem: Problem,
-    other: priors.Coordinates | None,
+    undetermined: priors.Coordinates | None,
     batch: predicted.ExperimentBatch,
     which: Array,
     z: Array,
@@ -200,34 +200,34 @@ def _predict_alternatives(
     """Readings of the menu for each alternative, and the square root of their covariance due to the fit.
 
     Args:
-        other: coordinates that the data do not determine at all and that keep their priors.
+        undetermined: coordinates that the data do not determine at all and that keep their priors.
         informed: Jacobian of the readings and priors at each fit.
     """
 
     def predict_alternative(
-        w: Array, z: Float[Array, " coordinates"], informed: Array
+        active: Array, z: Float[Array, " coordinates"], informed: Array
     ) -> tuple[predicted.MenuPrediction, Array]:
-        coordinates = problem.coordinates.with_effects(w)
+        coordinates = problem.coordinates.with_effects(active)
 
         def robot(x: Array) -> Robot:
-            base = problem.base if other is None else other.robot(problem.base, x[z.size :])
+            base = problem.base if undetermined is None else undetermined.robot(problem.base, x[z.size :])
             return coordinates.robot(base, x[: z.size])
 
-        wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
-        unknowns, solved = predicted.map_over_runs(IMPLICIT.solve, robot(wide), batch)
+        extended = jnp.concatenate([z, jnp.zeros(0 if undetermined is None else len(undetermined))])
+        unknowns, solved = predicted.map_over_runs(IMPLICIT.solve, robot(extended), batch)
 
         def readings(x: Array) -> tuple[Any, predicted.MenuPrediction]:
-            return predicted.predict_readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
+            return predicted.predict_readings(robot(x[: extended.size]), batch, unknowns + x[extended.size :], solved)
 
-        (acts, all_readings, left), roots = jax.jacfwd(readings, has_aux=True)(
-            jnp.concatenate([wide, jnp.zeros(unknowns.shape[1])])
+        (acts, all_readings, residuals), prediction = jax.jacfwd(readings, has_aux=True)(
+            jnp.concatenate([extended, jnp.zeros(unknowns.shape[1])])
         )
         slopes = predicted.arrange_readings(
-            batch, [a[:, : wide.size] for a in acts], implicit_slopes(all_readings, left)
+            batch, [a[:, : extended.size] for a in acts], implicit_slopes(all_readings, residuals)
         )
         half = jnp.concatenate([solve_lower(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
-        exists = roots.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(roots.value)
-        return dataclasses.replace(roots, exists=exists), half
+        exists = prediction.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(prediction.value)
+        return dataclasses.replace(prediction, exists=exists), half
 
     return jax.vmap(predict_alternative)(which, z, informed)
 
@@ -242,8 +242,8 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate]) -> 
     alternatives += [alternatives[0]] * (-len(alternatives) % PAD)
     robot = space.bare.base
     all_parameters = priors.loop_parameter_names(robot, robot.configurations.names)
-    more = [n for n in all_parameters if n not in space.coordinates.base.names]
-    other = priors.parameter_coordinates(robot, more) if more else None
+    further_names = [n for n in all_parameters if n not in space.coordinates.base.names]
+    undetermined = priors.parameter_coordinates(robot, further_names) if further_names else None
     equipped, indices = space.problem_for_sets(c.active for c in alternatives)
     active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in alternatives]))
@@ -253,28 +253,29 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate]) -> 
             for c, index_of_set in zip(alternatives, indices, strict=True)
         ]
     )
-    within = reach_of_space(space, space.bare.robot(jnp.asarray(alternatives[0].z[: space.free])))
-    menu_experiments, shown = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
-    batch = predicted.batch_experiments(menu_experiments, shown)
+    reach = reach_of_space(space, space.bare.robot(jnp.asarray(alternatives[0].z[: space.free])))
+    menu_experiments, channel_names = menu.experiment_menu(reach), channels.channel_names(space.bare.channels)
+    batch = predicted.batch_experiments(menu_experiments, channel_names)
     predictions, half = jax.tree.map(
-        lambda x: np.asarray(x)[: len(names)], _predict_alternatives(equipped, other, batch, active, z, informed)
+        lambda x: np.asarray(x)[: len(names)],
+        _predict_alternatives(equipped, undetermined, batch, active, z, informed),
     )
     experiments, possible = _possible_experiments(menu_experiments, predictions, space.settings)
     medians = np.median(space.equipped.data.sd, 0)
-    sd = predicted.reading_sds(experiments, dict(zip(shown, medians, strict=True)))
+    sd = predicted.reading_sds(experiments, dict(zip(channel_names, medians, strict=True)))
     value, half = (np.nan_to_num(x[:, possible]) for x in (predictions.value, half))
     exists = np.all(predictions.exists[:, possible], 0)
     return PredictedReadings(tuple(names), experiments, value, half, sd, exists, space.settings)
 
 
 def _possible_experiments(
-    experiments: Sequence[menu.Experiment], found: predicted.MenuPrediction, settings: Settings
+    experiments: Sequence[menu.Experiment], predictions: predicted.MenuPrediction, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
     """Experiments of a menu that are possible and allowed, and a mask of their readings among all readings of the
     menu.
 
     Args:
-        found: predictions for each alternative, the best fit first.
+        predictions: predictions for each alternative, the best fit first.
     """
     possible_experiments: list[menu.Experiment] = []
     masks: list[np.ndarray] = []
@@ -284,12 +285,12 @@ def _possible_experiments(
         if isinstance(e, menu.ProposedRuns):
             span = slice(end, end := end + len(e.voltage))
             steepest = math.inf if e.used is None else e.used.steepest
-            grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > steepest, menu.GRIP, np.inf)
-            possible_runs = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
-            if possible_runs.any():
-                hot, fast = (np.asarray(x)[0, span] for x in (found.temperature, found.speed))
-                e = menu.restrict_run(e, possible_runs, hot, fast)
-            rows = np.repeat(possible_runs, len(e.channels))
+            has_grip = np.abs(predictions.grip[:, span]) < np.where(np.asarray(e.slope) > steepest, menu.GRIP, np.inf)
+            possible = menu.possible_runs(e, np.all(predictions.feasible[:, span] & has_grip, 0))
+            if possible.any():
+                temperature, speed = (np.asarray(x)[0, span] for x in (predictions.temperature, predictions.speed))
+                e = menu.restrict_run(e, possible, temperature, speed)
+            rows = np.repeat(possible, len(e.channels))
         rows &= not {*e.kinds} & {*settings.forbidden}
         if rows.any():
             possible_experiments.append(e)
@@ -300,12 +301,12 @@ def _possible_experiments(
 # --- the choice -------------------------------------------------------------------------------------
 
 
-def _rank_experiment(seen: PredictedReadings, *experiments: str) -> RankedExperiment:
-    pairs = itertools.combinations(range(len(seen.names)), 2)
-    sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
-    separations = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
+def _rank_experiment(predictions: PredictedReadings, *experiments: str) -> RankedExperiment:
+    pairs = itertools.combinations(range(len(predictions.names)), 2)
+    sigma = tuple(predictions.apart(a, b, *experiments) for a, b in pairs)
+    separations = zip(predictions.names[1:], sigma, strict=False)  # the pairs of the best fit come first
     return RankedExperiment(
-        experiments, sigma, tuple(n for n, s in separations if s >= seen.settings.apart), seen.settings
+        experiments, sigma, tuple(n for n, s in separations if s >= predictions.settings.apart), predictions.settings
     )
 
 
@@ -313,33 +314,41 @@ def _usefulness(r: RankedExperiment) -> tuple[bool, float]:
     """Sort key of an experiment: True if it separates any pair well enough, then the expected number of separated
     pairs.
     """
-    return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
+    return bool(r.sufficient), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 
-def rank_experiments(seen: PredictedReadings) -> tuple[RankedExperiment, ...]:
+def rank_experiments(predictions: PredictedReadings) -> tuple[RankedExperiment, ...]:
     """Experiments of the menu, sorted by the expected number of separated pairs. Ties, within `Settings.enough`, keep
     the order of the menu, which begins with the least effort.
     """
-    return tuple(sorted((_rank_experiment(seen, e.name) for e in seen.experiments), key=_usefulness, reverse=True))
+    return tuple(
+        sorted(
+            (_rank_experiment(predictions, e.name) for e in predictions.experiments), key=_usefulness, reverse=True
+        )
+    )
 
 
-def choose_experiment(seen: PredictedReadings) -> Proposal:
+def choose_experiment(predictions: PredictedReadings) -> Proposal:
     """Experiment that separates most pairs of alternatives, with a second one if that helps enough."""
-    table = rank_experiments(seen)
+    table = rank_experiments(predictions)
     if not table:
         return Proposal((NONE,), Remark("nothing_possible"))
     plan = table[0]
-    rankings = (_rank_experiment(seen, plan.name, e.name) for e in seen.experiments if e.name != plan.name)
-    more = max(rankings, key=_usefulness, default=plan)
-    if more.told and (not plan.told or _usefulness(more)[1] > _usefulness(plan)[1] + seen.settings.gain):
-        plan = more
-    if not plan.told:
-        instruction = Remark("nothing_tells", names=seen.names, sigma=seen.settings.worth)
+    rankings = (
+        _rank_experiment(predictions, plan.name, e.name) for e in predictions.experiments if e.name != plan.name
+    )
+    pair = max(rankings, key=_usefulness, default=plan)
+    if pair.sufficient and (
+        not plan.sufficient or _usefulness(pair)[1] > _usefulness(plan)[1] + predictions.settings.gain
+    ):
+        plan = pair
+    if not plan.sufficient:
+        instruction = Remark("nothing_tells", names=predictions.names, sigma=predictions.settings.worth)
         return Proposal((NONE,), instruction, table=table)
-    by_name = {e.name: e for e in seen.experiments}
+    by_name = {e.name: e for e in predictions.experiments}
     instruction = Remark("carry_out", experiments=tuple(by_name[name] for name in plan.experiments))
-    settles = plan.smallest >= seen.settings.apart
-    return Proposal(plan.experiments, instruction, plan.separates, min(plan.told), settles, table)
+    settles = plan.smallest >= predictions.settings.apart
+    return Proposal(plan.experiments, instruction, plan.separates, min(plan.sufficient), settles, table)
 
 
 #: Number of runs in a series that covers the variable of a curve more densely, and of repeats that are averaged.
@@ -356,15 +365,17 @@ def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: b
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
     slope = max(u.steepest for u in within.used)
     payload = max(u.payloads[-1] for u in within.used)
-    step, angle, mass = (menu.step_of_settings(x, SERIES - 1) for x in (high - low, slope, payload))
+    voltage_step, slope_step, payload_step = (
+        menu.step_of_settings(x, SERIES - 1) for x in (high - low, slope, payload)
+    )
     low, high, slope, payload = (
         menu.last_setting(x, step_size)
-        for x, step_size in ((low, step), (high, step), (slope, angle), (payload, mass))
+        for x, step_size in ((low, voltage_step), (high, voltage_step), (slope, slope_step), (payload, payload_step))
     )
-    low = low or step
+    low = low or voltage_step
     return Remark(
         "more_runs", place=place, variable=variable, runs=SERIES, low=low, high=high, top=volts[-1], slope=slope,
-        payload=payload, steps=(step, angle, mass), within=within, by_duty=by_duty,
+        payload=payload, steps=(voltage_step, slope_step, payload_step), within=within, by_duty=by_duty,
     )  # fmt: skip
 
 
@@ -385,7 +396,7 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
     return Proposal((name,), instruction, (curve,), sigma)
 
 
-def propose_separating(space: CandidateSpace, best: Candidate, found: Classes) -> Proposal | None:
+def propose_separating(space: CandidateSpace, best: Candidate, found_classes: Classes) -> Proposal | None:
     """Experiment that separates the alternatives of a class. None if each effect has only one candidate name."""
-    alternatives = alternatives_of_class(best, found)
+    alternatives = alternatives_of_class(best, found_classes)
     return choose_experiment(predict_menu(space, alternatives)) if len(alternatives) > 1 else None

@@ -130,7 +130,7 @@ def found_effects(
     space: CandidateSpace,
     base: Candidate,
     best: Candidate,
-    found: classes.Classes,
+    found_classes: classes.Classes,
     test: adequacy.AdequacyTest,
 ) -> tuple[FoundEffect, ...]:
     """Result entry of each effect of the best candidate: its class, its parameters and its evidence.
@@ -139,18 +139,20 @@ def found_effects(
         test: adequacy test of the base fit. Its bootstrap gives the p-values.
     """
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
-    others = [base] if len(best.effects) == 1 else search.refit_without_each(space, best, found.ladder)
+    fits_without = [base] if len(best.effects) == 1 else search.refit_without_each(space, best, found_classes.ladder)
     null, excess = np.asarray(test.null.single), candidates.excess_misfit(space, base)
-    effects, fits = [], {c.key: c for c in reversed((best, *found.ladder))}
+    effects, fits = [], {c.key: c for c in reversed((best, *found_classes.ladder))}
 
     def class_member(leader: str, name: str) -> ClassMember:
-        other = fits[frozenset(best.with_effect(leader, name)) - {""}]
-        k, unit = other.active.index(name), amplitude_unit(space.library[name])
+        rival = fits[frozenset(best.with_effect(leader, name)) - {""}]
+        k, unit = rival.active.index(name), amplitude_unit(space.library[name])
         return ClassMember(
-            float(other.amplitude[k] * unit), float(other.size[k]), float(2 * (other.cost - best.cost))
+            float(rival.amplitude[k] * unit), float(rival.size[k]), float(2 * (rival.cost - best.cost))
         )
 
-    classes_of_effects = zip(found.members, found.stated, found.families, others, strict=True)
+    classes_of_effects = zip(
+        found_classes.members, found_classes.stated, found_classes.families, fits_without, strict=True
+    )
     for slot, (members, shifts, families, without) in enumerate(classes_of_effects):
         effect, gain = space.library[members[0]], float(2 * (without.cost - best.cost))
         equation, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
@@ -180,18 +182,18 @@ def _effect_parameters(space: CandidateSpace, best: Candidate, slot: int) -> dic
     effect, k = space.library[best.active[slot]], space.free + slot
     amplitude, unit = linearization.amplitude_of(effect), amplitude_unit(effect)
     fitted = float(best.amplitude[slot] * unit), float(space.settings.width * best.sd[k] * unit)
-    held_names = held_by_prior(best.sd)
-    values = {amplitude.name: ParameterEstimate(*fitted, amplitude.spec.unit, bool(held_names[k]))}
+    undetermined = held_by_prior(best.sd)
+    values = {amplitude.name: ParameterEstimate(*fitted, amplitude.spec.unit, bool(undetermined[k]))}
     shape = linearization.free_shape_parameter(effect)
     if shape is not None:
         k += space.settings.slots
-        value, slope = _shaped(linearization.shape_scales(shape), best.z[k])
+        value, slope = _shape_and_slope(linearization.shape_scales(shape), best.z[k])
         fitted = float(value), float(slope) * float(best.sd[k])
-        values[shape.name] = ParameterEstimate(*fitted, shape.spec.unit, bool(held_names[k]))
+        values[shape.name] = ParameterEstimate(*fitted, shape.spec.unit, bool(undetermined[k]))
     return values
 
 
-_shaped = jax.jit(jax.value_and_grad(linearization.shape_parameter_at, argnums=1))
+_shape_and_slope = jax.jit(jax.value_and_grad(linearization.shape_parameter_at, argnums=1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,30 +244,30 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
 
 def unnamed_discrepancy(
-    beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int, simulated: bool
+    base_curve: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int, simulated: bool
 ) -> UnnamedDiscrepancy | None:
     """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit.
 
     A simulated log has the curve to first order at the base fit of its equations. None for a wave there, which has
     its own phase in each run.
     """
-    curve, lacks = beside.at_base, {}
+    curve, row_values = base_curve.at_base, {}
     if not simulated:
-        fitted, linear = beside.fitted, beside.diagnosis.linear
-        at, value, sd, score = fitted.grid, fitted.curve, fitted.sd, fitted.chi2[0] - fitted.chi2[1]
-        if beside.space.bare.observe.one_row_reveals:
-            happens = bases.window_from_name(where.variable)
-            x, way = linear.curve_variable(where.place, where.variable if happens is None else happens.axis)
-            remains, row_sd = projection.balance_error_by_row(linear, where.place)
-            defect = np.interp(x, at, value) + way * remains
-            lacks = {"over": x[:rows], "defect": defect[:rows], "defect_sd": row_sd[:rows]}
+        fitted, linear = base_curve.fitted, base_curve.diagnosis.linear
+        grid, value, sd, score = fitted.grid, fitted.curve, fitted.sd, fitted.chi2[0] - fitted.chi2[1]
+        if base_curve.space.bare.observe.one_row_reveals:
+            window = bases.window_from_name(where.variable)
+            x, way = linear.curve_variable(where.place, where.variable if window is None else window.axis)
+            row_errors, row_sd = projection.balance_error_by_row(linear, where.place)
+            defect = np.interp(x, grid, value) + way * row_errors
+            row_values = {"over": x[:rows], "defect": defect[:rows], "defect_sd": row_sd[:rows]}
     elif where.variable in bases.ORDERS:
         return None
     else:
-        (at, value, sd), score = curve.drawn(curve.start, curve.covariance), curve.explained
+        (grid, value, sd), score = curve.drawn(curve.start, curve.covariance), curve.explained
     return UnnamedDiscrepancy(
-        **dataclasses.asdict(where), unit=beside.unit, effect=curve.effect, p_value=p_value, score=float(score),
-        at=at, value=value, sd=sd, proposal=beside.proposal, **lacks,
+        **dataclasses.asdict(where), unit=base_curve.unit, effect=curve.effect, p_value=p_value, score=float(score),
+        at=grid, value=value, sd=sd, proposal=base_curve.proposal, **row_values,
     )  # fmt: skip
 
 
@@ -277,7 +279,7 @@ class RejectedCandidate:
         effects: amplitude of each effect.
         prior_sds: the same amplitudes in prior sds.
         sizes: amplitudes relative to the largest plausible ones [-].
-        rise_chi2: χ² minus that of the proposed fit [σ²]. Negative if these effects explain more.
+        rise_chi2: χ² minus the χ² of the proposed fit [σ²]. Negative if these effects explain more.
         reasons: reasons why they are implausible.
     """
 
@@ -321,23 +323,25 @@ def listed_alternatives(
     return plausible, ruled_out
 
 
-def _alternative(space: CandidateSpace, c: Candidate, rise: float) -> RejectedCandidate:
-    amplitudes, sds, sizes, why = {}, {}, {}, list[loop_notes.RuledOut]()
-    for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
+def _alternative(space: CandidateSpace, candidate: Candidate, rise: float) -> RejectedCandidate:
+    amplitudes, sds, sizes, reasons = {}, {}, {}, list[loop_notes.RuledOut]()
+    for slot, (name, amplitude, size) in enumerate(
+        zip(candidate.active, candidate.amplitude, candidate.size, strict=True)
+    ):
         if not name:
             continue
         effect = space.library[name]
         sds[name], sizes[name] = float(amplitude), float(size)
         amplitudes[name] = float(amplitude) * amplitude_unit(effect)
-        sd = space.settings.width * float(c.sd[space.free + slot])
-        if name in c.supplying:
-            why.append(loop_notes.RuledOut(name, "power"))
+        sd = space.settings.width * float(candidate.sd[space.free + slot])
+        if name in candidate.supplying:
+            reasons.append(loop_notes.RuledOut(name, "power"))
         elif size >= 1:
             check = effect.rests_on or (linearization.amplitude_of(effect).spec.meaning,)
-            why.append(loop_notes.RuledOut(name, "size", float(size), tuple(check)))
-        elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
-            why.append(loop_notes.RuledOut(name, "edge"))
-    return RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
+            reasons.append(loop_notes.RuledOut(name, "size", float(size), tuple(check)))
+        elif not candidate.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
+            reasons.append(loop_notes.RuledOut(name, "edge"))
+    return RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(reasons))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
@@ -384,7 +388,7 @@ def parameter_shifts(
     z = [np.asarray(x[:p]) for x in (before, after)]
     value = [coordinates.stated, *(coordinates.value(x) for x in z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
-    fields, held_names = params.parameters_by_name(space.bare.base), held_by_prior(sd)
+    fields, undetermined = params.parameters_by_name(space.bare.base), held_by_prior(sd)
     bound = coordinates.beyond(z[1])
     return {
         name: ParameterShift(
@@ -396,7 +400,7 @@ def parameter_shifts(
             meaning=fields[name].spec.meaning,
             shift_before=float(z[0][k]),
             shift_after=float(z[1][k]),
-            held_by_prior=bool(held_names[k]),
+            held_by_prior=bool(undetermined[k]),
             at_bound=SIDE_OF_BOUND[int(bound[k])],
         )
         for k, name in enumerate(coordinates.names)
@@ -436,12 +440,13 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable) -> tuple[EffectScor
     """
     score_list = []
     for effect in space.library.effects:
-        m = space.library.best_instance(effect.name, np.asarray(scores.single))
-        best_amplitude, sigmas, unit = float(scores.amplitude[m]), float(scores.left[m]), amplitude_unit(effect)
+        instance = space.library.best_instance(effect.name, np.asarray(scores.single))
+        best_amplitude, sigmas = float(scores.amplitude[instance]), float(scores.left[instance])
+        unit = amplitude_unit(effect)
         spec = linearization.amplitude_of(effect).spec
         low = max(-space.settings.plausible, spec.bounds[0] / unit)
         amplitude = min(max(best_amplitude, low), space.settings.plausible)
-        explained = float(scores.single[m] ** 2 - ((best_amplitude - amplitude) * sigmas) ** 2)
+        explained = float(scores.single[instance] ** 2 - ((best_amplitude - amplitude) * sigmas) ** 2)
         score_list.append(
             EffectScore(
                 name=effect.name,
@@ -492,14 +497,14 @@ def rank_library(space: CandidateSpace, left: adequacy.Diagnosis) -> EffectRanki
     return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, ranking)
 
 
-def rank_effects_by_weak_form(space: CandidateSpace, known: search.WeakFormScreening) -> EffectRanking:
+def rank_effects_by_weak_form(space: CandidateSpace, screening: search.WeakFormScreening) -> EffectRanking:
     """Ranking of the effects by the equations of a log in weak form, before any simulation."""
-    p = search.single_p_value(float(np.max(known.scores.single**2)), known.null)
-    chance = float(np.quantile(known.null, 1 - space.settings.family_wise_error, method="higher")) ** 2
-    ranking = _rank_effects(space, known.scores)
-    shifts = parameter_shifts(space, known.base.z, known.base.z, known.base.sd)
+    p = search.single_p_value(float(np.max(screening.scores.single**2)), screening.null)
+    chance = float(np.quantile(screening.null, 1 - space.settings.family_wise_error, method="higher")) ** 2
+    ranking = _rank_effects(space, screening.scores)
+    shifts = parameter_shifts(space, screening.base.z, screening.base.z, screening.base.sd)
     parameters = {name: (shift.after, shift.sd_after) for name, shift in shifts.items()}
-    return EffectRanking(p <= space.settings.family_wise_error, p, chance, ranking, known.windows, parameters)
+    return EffectRanking(p <= space.settings.family_wise_error, p, chance, ranking, screening.windows, parameters)
 
 
 def _rank_effects(space: CandidateSpace, scores: ScoreTable) -> tuple[EffectScore, ...]:
@@ -508,8 +513,8 @@ def _rank_effects(space: CandidateSpace, scores: ScoreTable) -> tuple[EffectScor
 
 
 def invisible_effects(space: CandidateSpace, scores: ScoreTable, by_effect: Sequence[EffectScore]) -> Names:
-    """Effects that the data cannot reveal, because even their largest plausible amplitude hardly changes the
-    readings.
+    """Effects that the data cannot reveal, because even their largest plausible amplitude changes the
+    readings by less than `settings.visible`.
 
     Args:
         by_effect: result of `effect_scores`.
@@ -542,7 +547,7 @@ class HiddenEffect:
 
 
 def find_hidden_effects(
-    space: CandidateSpace, named: Names, left: ScoreTable, after: ScoreTable
+    space: CandidateSpace, named: Names, base_scores: ScoreTable, named_scores: ScoreTable
 ) -> tuple[HiddenEffect, ...]:
     """Effects that may be present in addition to the named ones, which would hide them, the largest first.
 
@@ -551,20 +556,20 @@ def find_hidden_effects(
     the readings by `needed` sigmas. The two are then strongly correlated.
 
     Args:
-        left, after: scores of the fits without and with the named effects.
+        base_scores, named_scores: scores of the fits without and with the named effects.
     """
     hidden = []
     for effect in space.library.effects:
-        m = space.library.best_instance(effect.name, np.asarray(left.left))
-        alone, beside = float(left.left[m]), float(after.left[m])
-        if effect.name in named or beside <= 0 or alone <= 0:
+        instance = space.library.best_instance(effect.name, np.asarray(base_scores.left))
+        sensitivity, remaining = float(base_scores.left[instance]), float(named_scores.left[instance])
+        if effect.name in named or remaining <= 0 or sensitivity <= 0:
             continue
-        centre, spread = float(after.amplitude[m]), np.sqrt(SAME) / beside
+        centre, spread = float(named_scores.amplitude[instance]), np.sqrt(SAME) / remaining
         ends = np.clip([centre - spread, centre + spread], -space.settings.plausible, space.settings.plausible)
         if effect.dissipative:
             ends = np.maximum(ends, 0.0)
         size = float(ends[np.argmax(np.abs(ends))])
-        if abs(size) * alone >= space.settings.needed and abs(size) * beside <= 2 * np.sqrt(SAME):
+        if abs(size) * sensitivity >= space.settings.needed and abs(size) * remaining <= 2 * np.sqrt(SAME):
             unit = linearization.amplitude_of(effect).spec.unit
-            hidden.append(HiddenEffect(effect.name, size * amplitude_unit(effect), unit, abs(size) * alone))
+            hidden.append(HiddenEffect(effect.name, size * amplitude_unit(effect), unit, abs(size) * sensitivity))
     return tuple(sorted(hidden, key=lambda h: -h.sigmas)[:MOST])

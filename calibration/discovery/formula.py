@@ -21,7 +21,7 @@ SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV
     c.name: f"Δ({c.label})" for c in channels.EVERY if c.name in READINGS
 }
 #: Variables of decays: symbol, and unit of the time constant.
-FADING = {"time": ("t", " s"), "order": ("k", "")}
+DECAYS = {"time": ("t", " s"), "order": ("k", "")}
 #: Exponents of a single factor, and in a product of two.
 POWERS, POWERS_PRODUCT = (-1.0, 0.5, 1.0, 2.0, 3.0), (-1.0, 0.5, 1.0, 2.0)
 #: Least share of the curve that a single term has to explain [-].
@@ -105,17 +105,17 @@ def monomial_dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -
         kinds: signal and reference value of each ratio.
     """
     low, high = ratios.min(0), ratios.max(0)
-    lively = [k for k in range(ratios.shape[1]) if high[k] - low[k] > 1e-6 * max(abs(high[k]), abs(low[k]), 1e-9)]
+    varying = [k for k in range(ratios.shape[1]) if high[k] - low[k] > 1e-6 * max(abs(high[k]), abs(low[k]), 1e-9)]
 
     def is_defined(k: int, p: float) -> bool:
         if p < 0:
             return low[k] > SAFE * high[k]
         return low[k] >= 0 or p == int(p)
 
-    single: list[tuple[tuple[int, float], ...]] = [((k, p),) for k in lively for p in POWERS if is_defined(k, p)]
+    single: list[tuple[tuple[int, float], ...]] = [((k, p),) for k in varying for p in POWERS if is_defined(k, p)]
     double: list[tuple[tuple[int, float], ...]] = [
         ((j, p), (k, q))
-        for j, k in itertools.combinations(lively, 2)
+        for j, k in itertools.combinations(varying, 2)
         for p, q in itertools.product(POWERS_PRODUCT, repeat=2)
         if is_defined(j, p) and is_defined(k, q)
     ]
@@ -163,7 +163,7 @@ class Proposal:
 
 
 def propose_formula(
-    linear: Linearization, balance: str, counts: np.ndarray, curve: SmoothCurve, *, voltage: bool = True
+    linear: Linearization, balance: str, included: np.ndarray, curve: SmoothCurve, *, voltage: bool = True
 ) -> Proposal:
     """Term with the smallest BIC among those that explain `MOST` of the curve, or a simpler one with as much
     evidence.
@@ -172,73 +172,75 @@ def propose_formula(
     than the one of the curve are penalised.
 
     Args:
-        counts: True for included rows, shape (rows,).
+        included: True for included rows, shape (rows,).
         curve: smooth curve that the formula is compared with.
         voltage: True for a rig with an imposed or measured voltage.
     """
-    if curve.happening:
+    if curve.temporary:
         level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
         formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
         axis = curve.variable.split()[0]
         return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, tried=1)
-    if curve.variable in FADING:
-        return _decay_formula(linear, balance, counts, curve)
-    counts = linear.at_points(counts)
-    known_of = [r for r in RATIOS if voltage or r.of != "voltage"]
-    scaled = tuple(r.scaled(r(linear, balance)[counts]) for r in known_of)
+    if curve.variable in DECAYS:
+        return _decay_formula(linear, balance, included, curve)
+    included = linear.at_points(included)
+    usable = [r for r in RATIOS if voltage or r.of != "voltage"]
+    scaled = tuple(r.scaled(r(linear, balance)[included]) for r in usable)
     ratios = np.stack([r(linear, balance) for r in scaled], 1)
-    dictionary = monomial_dictionary(ratios[counts], scaled)
+    dictionary = monomial_dictionary(ratios[included], scaled)
     terms = list(dictionary)
     if not terms:  # all runs have the same conditions
         return Proposal()
     shapes = np.zeros((linear.points, len(terms)))
     _, way = linear.curve_variable(balance, curve.variable)
-    shapes[counts] = way[counts, None] * np.stack(list(dictionary.values()), 1)
+    shapes[included] = way[included, None] * np.stack(list(dictionary.values()), 1)
     columns = place_signature(linear, balance, shapes)
     norm2, products = Projection.of(linear).norms(columns)
     scale = np.sqrt(np.maximum(norm2, 0))
     visible = scale > 1e-3 * np.linalg.norm(columns, axis=0)
     scale = np.where(visible, scale, 1.0)
     b = np.where(visible, -products / scale, 0.0)
-    cost = np.log(3 * counts.sum())
+    penalty = np.log(3 * included.sum())
     explained = b**2
-    located = {SAME_AS.get(curve.variable, curve.variable)}
-    foreign = np.array([len({*term.variables} - located) for term in terms])
-    dear = np.where(visible & (explained >= MOST * curve.explained), FOREIGN * foreign - explained, np.inf)
-    if not np.isfinite(dear).any():
+    curve_variables = {SAME_AS.get(curve.variable, curve.variable)}
+    foreign = np.array([len({*term.variables} - curve_variables) for term in terms])
+    penalised = np.where(visible & (explained >= MOST * curve.explained), FOREIGN * foreign - explained, np.inf)
+    if not np.isfinite(penalised).any():
         return Proposal(tried=len(terms))
-    near = np.flatnonzero(dear < dear.min() + NO_EVIDENCE)
-    k = min(near.tolist(), key=lambda j: (terms[j].complexity, dear[j]))
-    size, sd = float(b[k] / scale[k]), float(1 / scale[k])
+    nearly_best = np.flatnonzero(penalised < penalised.min() + NO_EVIDENCE)
+    k = min(nearly_best.tolist(), key=lambda j: (terms[j].complexity, penalised[j]))
+    coefficient, sd = float(b[k] / scale[k]), float(1 / scale[k])
     return Proposal(
-        expression=f"{SYMBOL[balance]} = {size:.2g} {PLACES[balance][0]} {terms[k]}",
+        expression=f"{SYMBOL[balance]} = {coefficient:.2g} {PLACES[balance][0]} {terms[k]}",
         terms=(terms[k],),
-        coefficients=(size,),
+        coefficients=(coefficient,),
         sds=(sd,),
         variables=tuple(dict.fromkeys(terms[k].variables)),
         explained=float(explained[k]),
-        gain=float((curve.freedom - 1) * cost - curve.explained + explained[k]),
+        gain=float((curve.freedom - 1) * penalty - curve.explained + explained[k]),
         tried=len(terms),
     )
 
 
-def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: SmoothCurve) -> Proposal:
+def _decay_formula(linear: Linearization, balance: str, included: np.ndarray, curve: SmoothCurve) -> Proposal:
     """Formula of an exponential decay with time, or from run to run, without an offset.
 
     The time constant is searched on a grid scaled to the length of the runs, or of the table. No offset is fitted,
     because the base parameters absorb it.
     """
-    (t, way), counts = linear.curve_variable(balance, curve.variable), linear.at_points(counts)
-    symbol, unit = FADING[curve.variable]
-    constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
-    shapes = way[:, None] * np.exp(-t[:, None] / constants) * counts[:, None]
+    (t, way), included = linear.curve_variable(balance, curve.variable), linear.at_points(included)
+    symbol, unit = DECAYS[curve.variable]
+    time_constants = np.geomspace(0.02, 2.0, 40) * max(float(t[included].max()), 1e-9)
+    shapes = way[:, None] * np.exp(-t[:, None] / time_constants) * included[:, None]
     norm2, products = Projection.of(linear).norms(place_signature(linear, balance, shapes))
     explained = np.where(norm2 > 0, products**2 / np.where(norm2 > 0, norm2, 1.0), -np.inf)
     k = int(np.argmax(explained))
     if not np.isfinite(explained[k]):
-        return Proposal(tried=len(constants))
-    value, sd = float(-products[k] / norm2[k]), float(norm2[k] ** -0.5)
-    expression = f"{SYMBOL[balance]} = {value:.2g} {PLACES[balance][0]} exp(-{symbol} / {constants[k]:.2g}{unit})"
-    gain = float((curve.freedom - 2) * np.log(3 * counts.sum()) - curve.explained + explained[k])
+        return Proposal(tried=len(time_constants))
+    coefficient, sd = float(-products[k] / norm2[k]), float(norm2[k] ** -0.5)
+    expression = (
+        f"{SYMBOL[balance]} = {coefficient:.2g} {PLACES[balance][0]} exp(-{symbol} / {time_constants[k]:.2g}{unit})"
+    )
+    gain = float((curve.freedom - 2) * np.log(3 * included.sum()) - curve.explained + explained[k])
     variables = (curve.variable,)
-    return Proposal(expression, (), (value,), (sd,), variables, float(explained[k]), gain, len(constants))
+    return Proposal(expression, (), (coefficient,), (sd,), variables, float(explained[k]), gain, len(time_constants))

@@ -15,7 +15,8 @@ from mmrjax.effects.curve import EVERY_VARIABLE
 
 #: Balances in which the current is a measure of the motors' load.
 OF_LOAD = ("motor", "gearbox", "track", "ground", "slip", "yaw")
-#: Range of the supply voltage over that of the duty, each over its largest, below which only the duty is varied [-].
+#: Ratio of the relative range of the supply voltage to the relative range of the duty, below which only the duty
+#: counts as varied [-].
 SAGS = 0.3
 
 
@@ -23,8 +24,10 @@ def varied_by_duty(runs: Runs) -> bool:
     """True if a table varies the motor voltage by the duty, while the supply voltage is constant except for sag."""
     if not (runs.has("duty") and runs.has(SUPPLY)):
         return False
-    duty, supply = (float(np.ptp(x) / max(np.max(x), 1e-300)) for x in map(np.abs, (runs["duty"], runs[SUPPLY])))
-    return duty > 0 and supply < SAGS * duty
+    duty_range, supply_range = (
+        float(np.ptp(x) / max(np.max(x), 1e-300)) for x in map(np.abs, (runs["duty"], runs[SUPPLY]))
+    )
+    return duty_range > 0 and supply_range < SAGS * duty_range
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,14 +72,14 @@ class DiscrepancyLocation:
     @property
     def window(self) -> dict[str, str | float] | None:
         """Axis, begin and end of a temporary change. None for other discrepancies."""
-        happens = bases.window_from_name(self.variable)
-        return None if happens is None else dataclasses.asdict(happens)
+        window = bases.window_from_name(self.variable)
+        return None if window is None else dataclasses.asdict(window)
 
     @property
     def family(self) -> str:
         """Equation and driving variable, in the words of `Effect.family`."""
-        happens = bases.window_from_name(self.variable)
-        variable = self.variable if happens is None else happens.axis
+        window = bases.window_from_name(self.variable)
+        variable = self.variable if window is None else window.axis
         subject = bases.place_in_words(self.place) if self.channel else EQUATION[self.balance]
         drivers = {name: v.driver for name, v in EVERY_VARIABLE.items() if v.driver}
         drivers |= {"current": "load" if self.balance in OF_LOAD else "current"}

@@ -107,8 +107,8 @@ def refine_by_simulation(space: CandidateSpace, fitted: Candidate, starts: Seque
         sets = None if active is None else [active]
         optima, _ = fit_from_each_start(problem, [z[:size]], [space.weight], sets, STEPS)
         optimum = jax.tree.map(lambda x: x[0], optima)
-        more = len(fitted.z) - size
-        z, sd = np.pad(optimum.z, (0, more)), np.pad(optimum.sd, (0, more), constant_values=1.0)
+        missing = len(fitted.z) - size
+        z, sd = np.pad(optimum.z, (0, missing)), np.pad(optimum.sd, (0, missing), constant_values=1.0)
         fits.append(candidate_of_fit(space, fitted.active, dataclasses.replace(optimum, z=z, sd=sd)))
     return min(fits, key=lambda x: x.cost)
 
@@ -117,22 +117,24 @@ def simulate_models(
     space: CandidateSpace,
     base: Candidate,
     best: Candidate,
-    known: Candidate | None = None,
+    simulated_base: Candidate | None = None,
     disturbed: bool = False,
 ) -> LogSimulation:
     """Simulates the base fit and the best fit of a log's linear rows, each refined by a few steps.
 
     Args:
-        known: simulated fit of the base. Its refinement starts there too.
+        simulated_base: simulated fit of the base. Its refinement starts there too.
         disturbed: True if the misfit of the best fit may count as noise.
     """
     space = space.with_room([*space.room, *best.effects])
-    starts = [] if known is None else [known.z]
-    last = refine_by_simulation(space, best, [best.z, *(starts if best is base else [])])
-    noisy = with_misfit(space, last) if disturbed else space
-    disturbed = noisy is not space
+    starts = [] if simulated_base is None else [simulated_base.z]
+    best_fit = refine_by_simulation(space, best, [best.z, *(starts if best is base else [])])
+    noisy_space = with_misfit(space, best_fit) if disturbed else space
+    disturbed = noisy_space is not space
     if disturbed:
-        space, last = noisy, refine_by_simulation(noisy, last, [last.z])
-    without = np.where(np.arange(len(last.z)) < space.free, last.z, 0.0)
-    first = last if best is base else refine_by_simulation(space, base, [base.z, without, *starts])
-    return LogSimulation(space, first, last, disturbed, 1 - best.cost / base.cost, 1 - last.cost / first.cost)
+        space, best_fit = noisy_space, refine_by_simulation(noisy_space, best_fit, [best_fit.z])
+    without_effects = np.where(np.arange(len(best_fit.z)) < space.free, best_fit.z, 0.0)
+    base_fit = best_fit if best is base else refine_by_simulation(space, base, [base.z, without_effects, *starts])
+    return LogSimulation(
+        space, base_fit, best_fit, disturbed, 1 - best.cost / base.cost, 1 - best_fit.cost / base_fit.cost
+    )

@@ -38,17 +38,17 @@ CHANCE = 3.0
 RIVALS = 3
 
 
-def windows_of_log(given: LoopInput) -> LoopInput | None:
+def windows_of_log(log_input: LoopInput) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states, or if its
     longest run has fewer than `LONG` steps, and for equations or other known results.
 
     Windows use every row of a log, except for an angle alone. Simulations use fewer.
     """
-    if given.equations is not None:
+    if log_input.equations is not None:
         return None
-    if given.known is not None and not isinstance(given.known.screened.base.space.bare.observe, Windows):
+    if log_input.known is not None and not isinstance(log_input.known.screened.base.space.bare.observe, Windows):
         return None
-    space, runs, sd, numbers = given.space, given.runs.whole, given.noise.sd, given.numbers
+    space, runs, sd, numbers = log_input.space, log_input.runs.whole, log_input.noise.sd, log_input.numbers
     observe: Any = space.bare.observe
     if not observe.long or observe.times.shape[1] < LONG:
         return None
@@ -56,7 +56,7 @@ def windows_of_log(given: LoopInput) -> LoopInput | None:
     motions = [c.settled for c in bare.channels if c.zero_at_rest]
     # A log of an angle alone keeps its thinned rows. With all of them, the class of EMPS is only tentative, and a
     # pendulum leaves twice its noise.
-    if given.runs.log is not None and (any(motions) or not motions):
+    if log_input.runs.log is not None and (any(motions) or not motions):
         sd = np.broadcast_to(np.median(sd, 0), runs.measured().shape)
         bare, numbers = observers.pose_problem(runs, bare.base, bare.coordinates, sd), np.arange(1, len(runs) + 1)
         observe = bare.observe
@@ -68,46 +68,46 @@ def windows_of_log(given: LoopInput) -> LoopInput | None:
         table = {name: x[rows] for name, x in runs.columns.items() if x.dtype.kind == "f"}
         return {**table, "configuration": np.asarray(observe.of_rows.configuration)[rows]}
 
-    settings = given.settings
+    settings = log_input.settings
     posed, rows = problem_of_windows(bare, fit, space.library.scored, columns, settings.width)
     shares = settings_for(type(posed.observe), settings.replicates).shares
     settings = dataclasses.replace(settings, shares=shares)
-    table = active_set.candidate_space(posed, space.library.effects, given.library, settings)
-    noise = dataclasses.replace(given.noise, sd=sd[rows])
+    table = active_set.candidate_space(posed, space.library.effects, log_input.library, settings)
+    noise = dataclasses.replace(log_input.noise, sd=sd[rows])
     return dataclasses.replace(
-        given, runs=runs.where(rows), numbers=numbers[rows], noise=noise, equations=table, known=None,
+        log_input, runs=runs.where(rows), numbers=numbers[rows], noise=noise, equations=table, known=None,
         settings=settings,
     )  # fmt: skip
 
 
-def readings_of_log(given: LoopInput, screened: Screening, sds: verdict.VerdictNoise, ranked: bool) -> LoopInput:
+def readings_of_log(log_input: LoopInput, screened: Screening, sds: verdict.VerdictNoise, ranked: bool) -> LoopInput:
     """The same input with the readings of a log as linear equations about the simulated fit of its base.
 
     Args:
         screened, sds: simulated fit of the base, and its noise.
         ranked: True if the effects have been ranked.
     """
-    space, settings, measured = screened.base.space, given.settings, given.runs.measured()
+    space, settings, measured = screened.base.space, log_input.settings, log_input.runs.measured()
     weight = space.weight.copy()
     weight[list(screened.outliers)] = np.isfinite(measured[list(screened.outliers)])
     problem = space.with_noise(None, weight).bare
     z = screened.base.candidate.z[: space.free]
     posed = problem_of_readings(problem, z, space.library.scored, settings.width)
-    equations = active_set.candidate_space(posed, space.library.effects, given.library, settings)
-    apart = given.kept_apart("readings")
+    equations = active_set.candidate_space(posed, space.library.effects, log_input.library, settings)
+    store_apart = log_input.kept_apart("readings")
 
     def keep(name: str, make: Callable[[], Any]) -> Any:
         """Stores a stage apart, except a second ranking."""
-        return None if ranked and name == "ranking" else apart(name, make)
+        return None if ranked and name == "ranking" else store_apart(name, make)
 
     confirm = functools.partial(smallest_confirmed, space)
     return dataclasses.replace(
-        given, equations=equations, noise=sds.noise, known=None, keep=keep, confirm=confirm
+        log_input, equations=equations, noise=sds.noise, known=None, keep=keep, confirm=confirm
     )  # fmt: skip
 
 
 def confirm_readings(
-    given: LoopInput, readings: LoopInput, screened: Screening, sds: verdict.VerdictNoise, traced: LoopStages
+    log_input: LoopInput, readings: LoopInput, screened: Screening, sds: verdict.VerdictNoise, traced: LoopStages
 ) -> LoopStages:
     """Stages of a log's linear readings after the simulation of the model that they choose.
 
@@ -120,20 +120,20 @@ def confirm_readings(
         traced = dataclasses.replace(
             traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks)
         )
-    linear = traced.screened.base
-    space = screened.base.space.with_noise(traced.sds.noise.sd, linear.space.weight)
-    given.progress(progress_remark("confirm"))
+    linear_fit = traced.screened.base
+    space = screened.base.space.with_noise(traced.sds.noise.sd, linear_fit.space.weight)
+    log_input.progress(progress_remark("confirm"))
     best = _chosen_fit(traced)
     space = space if traced.searched is None else space.with_room(traced.searched.room)
-    run = simulate_models(space, linear.candidate, best, screened.base.candidate)
-    traced = dataclasses.replace(traced, run=run)
+    simulation = simulate_models(space, linear_fit.candidate, best, screened.base.candidate)
+    traced = dataclasses.replace(traced, run=simulation)
     if traced.searched is None:
         return traced
-    confirmed = traced.left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    confirmed = traced.left.test.confirmed(max(0.0, 2 * (simulation.base.cost - simulation.best.cost)))
     if not confirmed.rejected and traced.screened.cluster is None:
         left = dataclasses.replace(traced.left, test=confirmed)
-        none = dataclasses.replace(run, best=run.base, promised=0.0, gained=0.0)
-        return LoopStages("none", traced.screened, left, traced.sds, run=none)
+        without_effects = dataclasses.replace(simulation, best=simulation.base, promised=0.0, gained=0.0)
+        return LoopStages("none", traced.screened, left, traced.sds, run=without_effects)
     return _lower_if_contradicted(readings, traced)
 
 
@@ -143,7 +143,7 @@ def smallest_confirmed(
 ) -> SearchResult:  # fmt: skip
     """The search with the smallest set whose simulation leaves no discrepancy, or else the largest set.
 
-    The diagnosis is that of its simulation.
+    The diagnosis belongs to the simulation of that set.
 
     Readings are linear near the fit of the base only. A large effect therefore leaves residuals that another one
     would explain.
@@ -158,12 +158,12 @@ def smallest_confirmed(
         return searched
     if len(best.effects) == 1 and not searched.diagnosis.test.rejected_with_margin:
         return searched
-    alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
-    sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
-    sizes = [[c for c in sets if _has_room(space, c)] for sets in sizes]
+    single = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
+    sets_by_size = [single[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
+    sets_by_size = [[c for c in sets if _has_room(space, c)] for sets in sets_by_size]
     space = space.with_noise(noise.sd, screened.base.space.weight)
-    space = space.with_room([*space.room, *(name for sets in sizes for c in sets for name in c.effects)])
-    for sets in filter(None, sizes):
+    space = space.with_room([*space.room, *(name for sets in sets_by_size for c in sets for name in c.effects)])
+    for sets in filter(None, sets_by_size):
         fits = [refine_by_simulation(space, c, [c.z]) for c in sets]
         k = min(range(len(fits)), key=lambda k: fits[k].cost)
         diagnosis = diagnose_candidate(space, fits[k], screened.bases, left, left.linear)
@@ -210,68 +210,82 @@ def _chosen_fit(traced: LoopStages) -> Candidate:
     return min(searched.ladder, key=lambda c: (c.key != effect_names, not c.plausible, c.cost))
 
 
-def delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
+def delayed_by_rows(log_input: LoopInput, fit: Candidate) -> Candidate:
     """The fit of a log's windows with a delay of whole rows, if that is near.
 
     A quantity that is held between rows jumps at each of them. So a fast current jumps when the delay crosses a row,
     and the steps of a fit do not lead across.
     """
-    coordinates, steps = given.space.coordinates.base, np.diff(given.runs.whole["time_s"])
-    if DELAY not in coordinates.names or given.robot.rig.between_rows == "linear":
+    coordinates, steps = log_input.space.coordinates.base, np.diff(log_input.runs.whole["time_s"])
+    if DELAY not in coordinates.names or log_input.robot.rig.between_rows == "linear":
         return fit
     k, step = coordinates.names.index(DELAY), float(np.median(steps[steps > 0]))
-    delay = float(coordinates.value(fit.z[: given.space.free])[k])
-    off = round(delay / step) * step - delay
-    if abs(off) > NEAREST * step:
+    delay = float(coordinates.value(fit.z[: log_input.space.free])[k])
+    offset = round(delay / step) * step - delay
+    if abs(offset) > NEAREST * step:
         return fit
-    return dataclasses.replace(fit, z=fit.z + np.eye(len(fit.z))[k] * off / float(coordinates.spread[k]))
+    return dataclasses.replace(fit, z=fit.z + np.eye(len(fit.z))[k] * offset / float(coordinates.spread[k]))
 
 
-def _lower_if_contradicted(table: LoopInput, traced: LoopStages) -> LoopStages:
+def _lower_if_contradicted(equations: LoopInput, traced: LoopStages) -> LoopStages:
     """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
-    run, searched, beside = traced.run, traced.searched, traced.beside
-    if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
+    simulation, searched, base_curve = traced.run, traced.searched, traced.beside
+    if (
+        simulation is None
+        or searched is None
+        or base_curve is None
+        or not simulation.contradicts
+        or traced.verdict == "place"
+    ):
         return traced
     if traced.verdict == "mechanism" and traced.mechanism is not None:  # a curve is not simulated
         return dataclasses.replace(traced, verdict="place") if traced.mechanism.effects else traced
-    mechanism = find_mechanism(beside, table.runs, searched.ladder, traced.predicted)
+    mechanism = find_mechanism(base_curve, equations.runs, searched.ladder, traced.predicted)
     level = "place" if mechanism is None or mechanism.fails else "mechanism"
-    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
+    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=base_curve.where)
 
 
-def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
+def confirm_windows(log_input: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
     """Stages of a log's windows after the simulation of the base model and of the chosen one.
 
     None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
     gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
     level. No effect is named if the simulation misses a channel.
     """
-    screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
+    screened, left, searched, base_curve = traced.screened, traced.left, traced.searched, traced.beside
 
-    def undescribed(missed: tuple[MissedChannel, ...]) -> LoopStages:
+    def undescribed(channels_missed: tuple[MissedChannel, ...]) -> LoopStages:
         return dataclasses.replace(
-            LoopStages("undescribed", screened, left, traced.sds, searched), beside=beside, run=traced.run,
-            predicted=traced.predicted, missed=missed, unused=verdict.unused_inputs(given.runs),
+            LoopStages("undescribed", screened, left, traced.sds, searched), beside=base_curve, run=traced.run,
+            predicted=traced.predicted, missed=channels_missed, unused=verdict.unused_inputs(log_input.runs),
         )  # fmt: skip
 
-    if given.known is not None:  # only the noise differs
-        if given.known.verdict == "undescribed":
-            return undescribed(given.known.missed)
-        refuted = given.known.run is not None and given.known.run.contradicts
+    if log_input.known is not None:  # only the noise differs
+        if log_input.known.verdict == "undescribed":
+            return undescribed(log_input.known.missed)
+        refuted = log_input.known.run is not None and log_input.known.run.contradicts
         return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
-    if searched is None or beside is None:
+    if searched is None or base_curve is None:
         return None
-    given.progress(progress_remark("confirm"))
-    reading_fit, base = _chosen_fit(traced), delayed_by_rows(given, screened.base.candidate)
-    best = base if reading_fit is screened.base.candidate else delayed_by_rows(given, reading_fit)
-    run = simulate_models(given.space.with_room(searched.room), base, best, disturbed=True)
-    confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
-    noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
-    if not confirmed.rejected or (not run.disturbed and excess_misfit(run.space, run.base) < noise):
+    log_input.progress(progress_remark("confirm"))
+    window_fit, base = _chosen_fit(traced), delayed_by_rows(log_input, screened.base.candidate)
+    best = base if window_fit is screened.base.candidate else delayed_by_rows(log_input, window_fit)
+    simulation = simulate_models(log_input.space.with_room(searched.room), base, best, disturbed=True)
+    confirmed = left.test.confirmed(max(0.0, 2 * (simulation.base.cost - simulation.best.cost)))
+    chance_misfit = CHANCE * math.sqrt(2 * float(np.sum(simulation.space.weight > 0)))
+    if not confirmed.rejected or (
+        not simulation.disturbed and excess_misfit(simulation.space, simulation.base) < chance_misfit
+    ):
         return None
-    traced = dataclasses.replace(traced, run=run)
-    missed_by_base, missed = (
-        functools.partial(verdict.missed_channels, run.space, given.runs, given.noise, run.diagnosis(x, left).linear)
-        for x in (run.base, run.best)
+    traced = dataclasses.replace(traced, run=simulation)
+    channels_missed_by_base, channels_missed = (
+        functools.partial(
+            verdict.missed_channels,
+            simulation.space,
+            log_input.runs,
+            log_input.noise,
+            simulation.diagnosis(x, left).linear,
+        )
+        for x in (simulation.base, simulation.best)
     )
-    return undescribed(missed_by_base()) if missed() else _lower_if_contradicted(windows, traced)
+    return undescribed(channels_missed_by_base()) if channels_missed() else _lower_if_contradicted(windows, traced)

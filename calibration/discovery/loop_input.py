@@ -49,9 +49,9 @@ class LoopInput:
         equations: candidate space of the windows or the linear readings of a log, whose rows are equations.
         confirm: function that chooses from the sets of a search in such equations by their simulation. Its
             arguments are base fit, its diagnosis, search and noise.
-        others: open while later programs are compiled on other cores. None if there is nothing to compile.
+        others: exit stack of the threads that compile later programs. None if there is nothing to compile.
         later: functions that begin to compile these programs from the fit of the base.
-        ranked: not empty once the library is ranked.
+        ranked: rankings of the library so far. Empty before the first one.
     """
 
     runs: Runs
@@ -74,7 +74,7 @@ class LoopInput:
     ranked: list[object] = dataclasses.field(default_factory=list)
 
     def kept_apart(self, word: str) -> population.StoreStage:
-        """Storage of stages apart from those of the log over time. Only the ranking has the same name."""
+        """Storage of stages under names that begin with `word`. Only the ranking keeps its name."""
         return lambda name, make: self.keep(name if name == "ranking" else f"{word} {name}", make)
 
     @property
@@ -124,16 +124,16 @@ def prepare_loop(
     for note in fit_notes.remarks_with_codes(ready.table_remarks, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
-    unshown = shown_states.missing_states_remarks(distinct, ready.robot)
+    missing_states = shown_states.missing_states_remarks(distinct, ready.robot)
     at_first = (
         *ready.inherited_remarks,
         *ready.log_remarks,
-        *unshown,
+        *missing_states,
         *fit_notes.remarks_with_codes(ready.table_remarks, "lost_motion"),
     )
     notes_so_far: fit_notes.Notes = (
         *notes, *ready.table_remarks, *ready.start_remarks, *ready.mass_remarks, *ready.inherited_remarks,
-        *ready.log_remarks, *unshown
+        *ready.log_remarks, *missing_states
     )  # fmt: skip
     output_turn = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
@@ -149,14 +149,14 @@ def prepare_loop(
     )
 
 
-def settled_input(given: LoopInput, prepare: Callable[..., LoopInput]) -> LoopInput | None:
+def settled_input(log_input: LoopInput, prepare: Callable[..., LoopInput]) -> LoopInput | None:
     """Input of the settled runs of a log that no fit describes. None if these are too few.
 
     Args:
         prepare: `prepare_loop` with the options of the loop.
     """
     try:
-        runs, remarks = preparation.settled_rows(given.runs.whole, given.robot, "unfitted")
+        runs, remarks = preparation.settled_rows(log_input.runs.whole, log_input.robot, "unfitted")
     except BadData:
         return None
     return prepare(runs, settled=remarks)

@@ -33,8 +33,8 @@ class PlacedCurve(NamedTuple):
 BETTER = 5.0
 #: Least share of its root that an effect keeps without any one row of a table, which may have a wrong reading.
 KEPT = 1 / math.sqrt(3)
-#: Zero error of an instrument over the rms of its readings, below which it is not established without a stated noise:
-#: sds that grow with the readings, or that are too small, leave such an offset.
+#: Zero error of an instrument over the rms of its readings, below which it is not established without a stated noise.
+#: Assumed sds that grow with the readings, or that are too small, leave such an offset.
 SMALL_OFFSET = 0.05
 #: Largest relative change of an amplitude over a variable for an established law.
 FORM = 0.3
@@ -219,7 +219,7 @@ class Mechanism:
         gain, se: hold-out gain and its standard error, over the readings that it changes [nat per reading].
         again: share of the informative blocks for which a fit without the block finds it again [-].
         errors: standard error of the gain for each kind of block [nat per reading].
-        ammeter: those families that are errors of an ammeter beside a loss.
+        ammeter: families that are errors of an ammeter and would imitate a loss.
         run, changed: run and constant of a log, see `NameTest`, if the constant explains as much by a difference in
             that run. None and any constant otherwise.
     """
@@ -333,25 +333,25 @@ class Headline:
     values: tuple[tuple[AlternativeValue, ...], ...] = ()
 
 
-def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
+def headline(main: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
     """The most detailed claims that the verdicts at all noise levels share.
 
     Args:
         others: factor on the noise, and verdict, of each other noise level.
     """
-    verdicts = [said, *(summary for _, summary in others)]
+    verdicts = [main, *(summary for _, summary in others)]
     factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
     if len({s.verdict if s.verdict in WITHOUT_CLAIM else "" for s in verdicts}) > 1:
         return Headline("open", (), factors)
-    if said.verdict in WITHOUT_CLAIM:
-        return Headline(said.verdict, (), factors)
+    if main.verdict in WITHOUT_CLAIM:
+        return Headline(main.verdict, (), factors)
     laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in verdicts])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(
             m.values or len(m.families) > len(m.names) for s in verdicts for m in s.missing
         )
         effects_of_laws = [
-            next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
+            next(m for m in main.missing if m.established and set(m.names) & set(names)) for names in laws
         ]
         families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
         return Headline("named" if alone else "class", laws, factors, (), families, values)
@@ -362,20 +362,20 @@ def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]
     return Headline("place", places, factors, shared)
 
 
-def _claimed_families(said: VerdictSummary) -> list[Names]:
+def _claimed_families(summary: VerdictSummary) -> list[Names]:
     """Families of each established law or mechanism."""
-    families = [m.families for m in said.missing if m.established]
-    if said.verdict == "mechanism" and said.mechanism is not None:
-        families.append(said.mechanism.families)
+    families = [m.families for m in summary.missing if m.established]
+    if summary.verdict == "mechanism" and summary.mechanism is not None:
+        families.append(summary.mechanism.families)
     return families
 
 
-def _claimed_equations(said: VerdictSummary) -> list[Names]:
+def _claimed_equations(summary: VerdictSummary) -> list[Names]:
     """Equations with a discrepancy, in words, without their variable."""
-    families = _claimed_families(said)
-    if said.verdict in WITHOUT_NAME and said.where is not None:
-        families.append((said.where.family,))
-    return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
+    families = _claimed_families(summary)
+    if summary.verdict in WITHOUT_NAME and summary.where is not None:
+        families.append((summary.where.family,))
+    return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in names)) for names in families]
 
 
 def _shared_claims(
@@ -388,11 +388,17 @@ def _shared_claims(
     """
     counts: dict[Names, int] = {}
     for claim in claims[0]:
-        alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
-        if all(alike):
-            effect_names = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
-            shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
-            ordered_names = (*shared, *(n for n in effect_names if n not in shared))
+        overlapping = [
+            [other for other in claims_of_verdict if set(other) & set(claim)] for claims_of_verdict in claims[1:]
+        ]
+        if all(overlapping):
+            members = dict.fromkeys(
+                [*claim, *(n for claims_of_verdict in overlapping for other in claims_of_verdict for n in other)]
+            )
+            shared = [
+                n for n in claim if all(any(n in o for o in claims_of_verdict) for claims_of_verdict in overlapping)
+            ]
+            ordered_names = (*shared, *(n for n in members if n not in shared))
             if not any(set(ordered_names) <= set(other) for other in counts):
                 counts[ordered_names] = len(shared)
     largest_claims = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}

@@ -30,12 +30,12 @@ from calibration.inference import blocks as blocks_room
 
 #: Fits with and without the effects of one family.
 Fits = tuple[Candidate, Candidate]
-#: Number of parameters of a curve, each of which lowers χ² by one without a discrepancy [σ²].
+#: Decrease of χ² by a curve without any discrepancy: one for each of its parameters [σ²].
 OF_CURVE = 5.0
 
 
 def find_mechanism(
-    beside: BaseCurve, runs: Runs, ladder: Sequence[Candidate], predicted: Predicted
+    base_curve: BaseCurve, runs: Runs, ladder: Sequence[Candidate], predicted: Predicted
 ) -> Mechanism | None:
     """Mechanism that explains most of the discrepancy of the base fit. If it fails, the next one that does not.
 
@@ -44,85 +44,85 @@ def find_mechanism(
     simulation confirms a curve there.
 
     Args:
-        beside: smooth curve of the discrepancy, with the base fit.
+        base_curve: smooth curve of the discrepancy, with the base fit.
         ladder: candidates that were fitted.
         predicted: hold-out predictions of fits that are already known.
     """
-    space, base, linear = beside.space, beside.base, beside.left.linear
-    settings, over_time = beside.settings, beside.space.bare.observe.over_time
+    space, base, linear = base_curve.space, base_curve.base, base_curve.left.linear
+    settings, over_time = base_curve.settings, base_curve.space.bare.observe.over_time
     best = _best_by_family(space, ladder)
     pairs = _explained_by_family(space, base, ladder, best)
-    explained, alike, less = _rank_families(beside, pairs)
-    located, *_ = location_families = _families_of_location(beside.where)
-    most, excess = max(explained.values()), excess_misfit(space, base)
-    by_name = [(f, True) for f in (*alike, *less) if f in best and _explained(pairs[f]) >= HALF * most]
-    curved = [(located, False)] * (located in alike and space.bare.observe.reads)
+    explained, alike, weaker = _rank_families(base_curve, pairs)
+    curve_family, *_ = location_families = _families_of_location(base_curve.where)
+    largest, excess = max(explained.values()), excess_misfit(space, base)
+    effect_leaders = [(f, True) for f in (*alike, *weaker) if f in best and _explained(pairs[f]) >= HALF * largest]
+    curve_leaders = [(curve_family, False)] * (curve_family in alike and space.bare.observe.reads)
     run, changed, root = None, "", 0.0
     if over_time:
-        run, changed, root = standing.changed_run(space, linear, beside.bases, Projection.of(linear))
+        run, changed, root = standing.changed_run(space, linear, base_curve.bases, Projection.of(linear))
     blocks = masks_of_blocks(blocks_room.predictable_blocks(runs, space.bare))
-    curves = functools.cache(functools.partial(_curves_without_blocks, beside, blocks))
+    curves = functools.cache(functools.partial(_curves_without_blocks, base_curve, blocks))
     mechanisms: list[Mechanism] = []
-    for leader, with_effects in (*by_name[:1], *curved, *by_name[1:]):
+    for leader, with_effects in (*effect_leaders[:1], *curve_leaders, *effect_leaders[1:]):
         effects: Names = ()
-        families = (leader, *alike, *(() if with_effects else less))
+        families = (leader, *alike, *(() if with_effects else weaker))
         if (
             with_effects
-            and standing.evidence_over_curves(beside, best[leader], base, best[leader].effects, linear) < -BETTER
+            and standing.evidence_over_curves(base_curve, best[leader], base, best[leader].effects, linear) < -BETTER
         ):
             # A driver whose form a curve refutes is no better than those that curves cannot separate.
             families = (*families, *location_families)
-        families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
+        families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, base_curve.where))))
         if with_effects:
             effects, gain = gains.best_hold_out_gain(
                 space, runs, ladder, best[leader], base, pairs[leader], predicted
             )
-            again = standing.recurrence_of_families(beside, best[leader], families, blocks)
-            if again < AGAIN:  # several effects together may be found again only by their sum
-                again = max(again, _curve_recurrence(*curves(), families, settings))
+            recurrence = standing.recurrence_of_families(base_curve, best[leader], families, blocks)
+            if recurrence < AGAIN:  # only the sum of several effects may recur
+                recurrence = max(recurrence, _curve_recurrence(*curves(), families, settings))
         else:
             hold_out = gains.linear_gain_of_curve if over_time else gains.hold_out_gain_of_curve
-            gain, again = hold_out(beside, runs, predicted), _curve_recurrence(*curves(), families, settings)
+            gain, recurrence = hold_out(base_curve, runs, predicted), _curve_recurrence(*curves(), families, settings)
         by_leader = explained.get(leader, 0.0)
         mechanism = Mechanism(
-            families, effects, share_of_excess(excess, by_leader), gain.mean, gain.se, again, gain.errors,
+            families, effects, share_of_excess(excess, by_leader), gain.mean, gain.se, recurrence, gain.errors,
             errors_of_ammeters(space, families), run if root**2 >= by_leader else None, changed,
         )  # fmt: skip
         mechanisms.append(mechanism)
         if not mechanism.fails:
-            return _with_ammeter_families(beside, mechanism)
-    return _with_ammeter_families(beside, mechanisms[0]) if mechanisms else None
+            return _with_ammeter_families(base_curve, mechanism)
+    return _with_ammeter_families(base_curve, mechanisms[0]) if mechanisms else None
 
 
-def _rank_families(beside: BaseCurve, pairs: dict[str, Fits]) -> tuple[dict[str, float], Names, Names]:
+def _rank_families(base_curve: BaseCurve, pairs: dict[str, Fits]) -> tuple[dict[str, float], Names, Names]:
     """Decrease of χ² by the effects of each family and by the curve [σ²], and the families that explain most.
 
     If the curve explains most, also other families of its location.
     """
-    families = _families_of_location(beside.where)
-    if beside.space.bare.observe.over_time:  # fits of curves take long, and windows have none
-        by_curve = beside.where.explained - OF_CURVE
+    families = _families_of_location(base_curve.where)
+    if base_curve.space.bare.observe.over_time:  # fits of curves take long, and windows have none
+        by_curve = base_curve.where.explained - OF_CURVE
     else:
-        by_curve = beside.fitted.chi2[0] - beside.fitted.chi2[1] - OF_CURVE
+        by_curve = base_curve.fitted.chi2[0] - base_curve.fitted.chi2[1] - OF_CURVE
     explained = {family: _explained(pair) for family, pair in pairs.items()}
     explained[families[0]] = max(by_curve, explained.get(families[0], 0.0))
-    most = max(explained.values())
-    alike = [f for f in explained if explained[f] >= most - beside.settings.tolerance(most)]
+    largest = max(explained.values())
+    alike = [f for f in explained if explained[f] >= largest - base_curve.settings.tolerance(largest)]
     alike.sort(key=lambda f: -explained[f])
-    less = [f for f in families if f not in alike and explained[alike[0]] == by_curve]
-    return explained, tuple(alike), tuple(less)
+    weaker = [f for f in families if f not in alike and explained[alike[0]] == by_curve]
+    return explained, tuple(alike), tuple(weaker)
 
 
-def _with_ammeter_families(beside: BaseCurve, mechanism: Mechanism) -> Mechanism:
+def _with_ammeter_families(base_curve: BaseCurve, mechanism: Mechanism) -> Mechanism:
     """The mechanism with ammeter errors that explain the data as well, see `ammeter_families`."""
-    space, linear = beside.space, beside.left.linear
+    space, linear = base_curve.space, base_curve.left.linear
     if mechanism.effects:
         members = [space.library.names[k] in mechanism.effects for k in space.library.of]
         columns = np.asarray(linear.signatures)[:, members]
     else:
-        columns = location_columns(linear, beside.bases, beside.where)
-    also = ammeter_families(space, Projection.of(linear), columns, mechanism.families[0], beside.settings)
-    families = tuple(dict.fromkeys((*mechanism.families, *also)))
+        columns = location_columns(linear, base_curve.bases, base_curve.where)
+    ammeter = ammeter_families(space, Projection.of(linear), columns, mechanism.families[0], base_curve.settings)
+    families = tuple(dict.fromkeys((*mechanism.families, *ammeter)))
     return dataclasses.replace(mechanism, families=families, ammeter=errors_of_ammeters(space, families))
 
 
@@ -180,20 +180,20 @@ def _families_of_location(where: DiscrepancyLocation) -> Names:
 # --- hold-out blocks ------------------------------------------------------------------------------------
 
 
-def _curves_without_blocks(beside: BaseCurve, blocks: Sequence[np.ndarray]) -> tuple[Names, np.ndarray]:
+def _curves_without_blocks(base_curve: BaseCurve, blocks: Sequence[np.ndarray]) -> tuple[Names, np.ndarray]:
     """Family of each smooth curve, and what each explains and could explain [σ²], shape (1 + blocks, curves, 2).
 
     The first entry is with all rows, the others are without each block.
     """
-    space, linear, names = beside.space, beside.left.linear, bases_room.family_names(beside.bases)
+    space, linear, names = base_curve.space, base_curve.left.linear, bases_room.family_names(base_curve.bases)
     smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES or v in bases_room.ORDERS]
     families = tuple(
-        dataclasses.replace(beside.where, place=p, variable=v).family for p, v in (names[k] for k in smooth)
+        dataclasses.replace(base_curve.where, place=p, variable=v).family for p, v in (names[k] for k in smooth)
     )
-    columns, fit = [family_columns(linear, beside.bases, k) for k in smooth], Projection.of(linear)
+    columns, fit = [family_columns(linear, base_curve.bases, k) for k in smooth], Projection.of(linear)
     explained = []
-    for out in (np.zeros(len(space.included), bool), *blocks):
-        kept_rows = standing.kept_readings(space, out, linear.readings)
+    for left_out in (np.zeros(len(space.included), bool), *blocks):
+        kept_rows = standing.kept_readings(space, left_out, linear.readings)
         without_block = fit.only(kept_rows)
         explained.append([without_block.explained(c[kept_rows]) for c in columns])
     return families, np.array(explained)
@@ -210,8 +210,8 @@ def _curve_recurrence(curves: Names, explained: np.ndarray, families: Sequence[s
     akin = np.isin(curves, families)
     if not akin.any():
         return 1.0
-    before, again = 0.5 * explained[0, akin, 1].max(), []
-    for by_curve, could in np.moveaxis(explained[1:], 2, 1):
-        if could[akin].max() >= before:
-            again.append(by_curve[akin].max() >= by_curve.max() - settings.tolerance(by_curve.max()))
-    return float(np.mean(again)) if again else 1.0
+    least_information, recurs = 0.5 * explained[0, akin, 1].max(), []
+    for by_curve, information in np.moveaxis(explained[1:], 2, 1):
+        if information[akin].max() >= least_information:
+            recurs.append(by_curve[akin].max() >= by_curve.max() - settings.tolerance(by_curve.max()))
+    return float(np.mean(recurs)) if recurs else 1.0

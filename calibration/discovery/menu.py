@@ -188,7 +188,7 @@ LEAST_SETTING = 0.05
 #: Usual steps of settings, times powers of ten.
 STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 #: Tolerance of a setting above the table's largest, because readings scatter [-].
-ABOUT = 0.01
+SETTING_TOLERANCE = 0.01
 
 
 def step_of_settings(span: float, count: int) -> float:
@@ -201,12 +201,10 @@ def step_of_settings(span: float, count: int) -> float:
 
 
 def last_setting(most: float, step: float) -> float:
-    """Largest multiple of a step that is at most `most`, with the tolerance `ABOUT`. `most` itself if the step
-    is 0.
-    """
+    """Largest multiple of a step up to `most`, with `SETTING_TOLERANCE`. `most` itself if the step is 0."""
     if step == 0:
         return most
-    return float(f"{step * math.floor(most * (1 + ABOUT) / step + 1e-9):.6g}")
+    return float(f"{step * math.floor(most * (1 + SETTING_TOLERANCE) / step + 1e-9):.6g}")
 
 
 def floor_significant(value: float) -> float:
@@ -224,15 +222,16 @@ def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
 # --- acts -------------------------------------------------------------------------------------------
 
 
-def _mass_difference(robot: Robot, at: Array) -> Array:
+def _mass_difference(robot: Robot, settings: Array) -> Array:
     """Mass of the loaded robot minus the mass that its file states."""
-    still = State(*(jnp.zeros(()),) * 4)
+    zero_state = State(*(jnp.zeros(()),) * 4)
     plain_robot = without_effects_of(robot, "mass")
-    loads = [Conditions(configuration=k.astype(int), payload=m) for k, m in at]
+    conditions = [Conditions(configuration=k.astype(int), payload=m) for k, m in settings]
     return jnp.stack(
         [
-            balances.begin_signals(robot, c, still).mass - balances.begin_signals(plain_robot, c, still).mass
-            for c in loads
+            balances.begin_signals(robot, c, zero_state).mass
+            - balances.begin_signals(plain_robot, c, zero_state).mass
+            for c in conditions
         ]
     )
 
@@ -253,27 +252,29 @@ def calibration_acts(reach: Reach) -> tuple[CalibrationAct, ...]:
     """Calibrations that are possible with the instruments of the table, those of least effort first."""
     payload = round_significant(max(u.payloads[-1] for u in reach.used))
     loads = (0.0, payload) if payload > 0 else (0.0,)
-    total = reach.current * reach.motors
-    amperes = round_significant(0.15 * total, 1), round_significant(0.75 * total, 1)
-    turning = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
-    paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
+    total_current = reach.current * reach.motors
+    shunt_currents = round_significant(0.15 * total_current, 1), round_significant(0.75 * total_current, 1)
+    motor_speeds = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
+    speeds = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
     settings = tuple((float(u.index), m) for u in reach.used for m in loads)
 
-    def read(name: str, channel: str, signal: str, values: tuple[float, ...], sd: float) -> list[CalibrationAct]:
+    def acts_with_channel(
+        name: str, channel: str, signal: str, values: tuple[float, ...], sd: float
+    ) -> list[CalibrationAct]:
         act = CalibrationAct(name, (name,), _Instrument(channel, (signal,)), tuple((v,) for v in values), sd)
         return [act] * (channel in reach.measured)
 
     acts = [CalibrationAct("weigh", ("weigh",), _mass_difference, settings, 0.02, repeats=1)] * reach.has_ground
-    acts += read("zero current", "total_current", "total_current", (0.0,), 0.02)
-    acts += read("shunt", "total_current", "total_current", amperes, 0.02)
+    acts += acts_with_channel("zero current", "total_current", "total_current", (0.0,), 0.02)
+    acts += acts_with_channel("shunt", "total_current", "total_current", shunt_currents, 0.02)
     for c in channels.channels_named(reach.measured):
         if c.misses_zero:
             zero = _Instrument(c.name, STILL)
             acts.append(
                 CalibrationAct(f"zero of {c.label}", ("zero reading",), zero, ((0.0,),), None, channel=c.name)
             )
-    acts += read("strobe", "motor_speed", "speed_motor", turning, 5 * RPM)
-    acts += read("timing", "speed", "speed", paces, 3e-3)
+    acts += acts_with_channel("strobe", "motor_speed", "speed_motor", motor_speeds, 5 * RPM)
+    acts += acts_with_channel("timing", "speed", "speed", speeds, 3e-3)
     return tuple(acts)
 
 
@@ -340,44 +341,49 @@ def _travel_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]
     """Runs of the robot with one configuration."""
 
     volts = used.voltages
-    ends, three = (volts[0], volts[-1]), (volts[0], volts[len(volts) // 2], volts[-1])
+    end_voltages, three_voltages = (volts[0], volts[-1]), (volts[0], volts[len(volts) // 2], volts[-1])
     inclines = sorted({abs(s) for s in used.slopes if s}) or [0.0]
-    some, more, most = inclines[(len(inclines) - 1) // 2], inclines[max(len(inclines) - 2, 0)], inclines[-1]
-    air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
+    median_slope, second_steepest, steepest = (
+        inclines[(len(inclines) - 1) // 2],
+        inclines[max(len(inclines) - 2, 0)],
+        inclines[-1],
+    )
+    lifted_voltages, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
     runs = functools.partial(_combined_runs, reach, used=used)
     experiments = [
-        runs("reverse", "backwards", facing_backward, voltages=ends, slopes=(0.0, -some)),
-        runs("downhill", "about", voltages=ends, slopes=(-inclines[0], -some)),
-        runs("lifted", "lifted", lifted, voltages=air, read=TURNING),
-        runs("one motor", "one lifted", lifted, kinds=("one motor", "lifted"), voltages=air, sides=1,
+        runs("reverse", "backwards", facing_backward, voltages=end_voltages, slopes=(0.0, -median_slope)),
+        runs("downhill", "about", voltages=end_voltages, slopes=(-inclines[0], -median_slope)),
+        runs("lifted", "lifted", lifted, voltages=lifted_voltages, read=TURNING),
+        runs("one motor", "one lifted", lifted, kinds=("one motor", "lifted"), voltages=lifted_voltages, sides=1,
              read=TURNING),
-        runs(f"payload {payload:g} kg", "laden", kinds=("payload",), voltages=ends,
-             slopes=(0.0, some, most), payload=payload),
-        runs("other voltages", "travel", voltages=other_voltages(reach, volts), slopes=(0.0, more)),
-        runs("steepest slope", "travel", voltages=three, steepest=True,
-             slopes=[round(2 * most * share) / 2 for share in (SLOPE, (1 + SLOPE) / 2)]),
+        runs(f"payload {payload:g} kg", "laden", kinds=("payload",), voltages=end_voltages,
+             slopes=(0.0, median_slope, steepest), payload=payload),
+        runs("other voltages", "travel", voltages=other_voltages(reach, volts), slopes=(0.0, second_steepest)),
+        runs("steepest slope", "travel", voltages=three_voltages, steepest=True,
+             slopes=[round(2 * steepest * share) / 2 for share in (SLOPE, (1 + SLOPE) / 2)]),
         runs("crawl", "travel", voltages=[round_significant(share * volts[0]) for share in (0.15, 0.2, 0.27)]),
     ]  # fmt: skip
-    lacks = {
-        "downhill": most == 0, "steepest slope": most == 0, "payload": payload == 0, "one motor": reach.motors == 1,
+    impossible = {
+        "downhill": steepest == 0, "steepest slope": steepest == 0, "payload": payload == 0,
+        "one motor": reach.motors == 1,
     }  # fmt: skip
-    return tuple(r for r in experiments if not lacks.get(r.kinds[0], False))
+    return tuple(r for r in experiments if not impossible.get(r.kinds[0], False))
 
 
 def _motor_runs(reach: Reach) -> tuple[ProposedRuns, ...]:
     """Runs of the motors without the robot."""
-    volts = spaced_settings(0.2 * reach.alone, reach.alone, 5)
-    stalling = spaced_settings(
+    no_load_voltages = spaced_settings(0.2 * reach.alone, reach.alone, 5)
+    stall_voltages = spaced_settings(
         0.5 * reach.current * reach.resistance, min(reach.current * reach.resistance, reach.voltage), 2
     )
-    brake = round_significant(0.6 * reach.torque_constant * reach.current, 1)
+    brake_torque = round_significant(0.6 * reach.torque_constant * reach.current, 1)
     experiments = [
-        _combined_runs(reach, "bare motor", "alone", uncoupled, voltages=volts, read=TURNING),
-        _combined_runs(reach, "stall", "held", locked, voltages=stalling, read=STANDING),
-        _combined_runs(reach, "stall, one motor", "one held", locked, kinds=("stall", "one motor"), voltages=stalling,
-              read=STANDING, sides=1),
+        _combined_runs(reach, "bare motor", "alone", uncoupled, voltages=no_load_voltages, read=TURNING),
+        _combined_runs(reach, "stall", "held", locked, voltages=stall_voltages, read=STANDING),
+        _combined_runs(reach, "stall, one motor", "one held", locked, kinds=("stall", "one motor"),
+              voltages=stall_voltages, read=STANDING, sides=1),
         _combined_runs(reach, "braked motor", "braked", braked,
-              voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3), read=TURNING, brake=brake),
+              voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3), read=TURNING, brake=brake_torque),
     ]  # fmt: skip
     return tuple(r for r in experiments if reach.motors > 1 or r.sides is None)
 
@@ -399,28 +405,36 @@ def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
 
 def _shaft_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
     """Proposed runs for a shaft load, or an imposed speed or current: other levels, torques and direction."""
-    others_of = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
+    names_of_levels = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
     levels = used.voltages if reach.imposed == "voltage" else reach.levels
-    high = round_significant(max(map(abs, levels), default=0.0)) or 1.0
-    sizes = tuple(sorted({x for v in levels if (x := round_significant(abs(v))) >= LEAST_SETTING * high})) or (high,)
-    low = max(0.4 * sizes[0], LEAST_SETTING * high)
-    allowed = {"voltage": reach.voltage, "motor_speed": reach.geared}.get(reach.imposed, math.inf)
-    top = round_significant(1.3 * high) if 1.3 * high < allowed else floor_significant(max(allowed, high))
-    between = 0.5 * (sizes[0] + high) if top > high else 0.5 * (low + high)
-    others = tuple(sorted({round_significant(low), round_significant(between), top}))
-    way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
-    ends = [way * x for x in (sizes[0], sizes[-1])]
+    largest = round_significant(max(map(abs, levels), default=0.0)) or 1.0
+    magnitudes = tuple(
+        sorted({x for v in levels if (x := round_significant(abs(v))) >= LEAST_SETTING * largest})
+    ) or (largest,)
+    lowest = max(0.4 * magnitudes[0], LEAST_SETTING * largest)
+    limit = {"voltage": reach.voltage, "motor_speed": reach.geared}.get(reach.imposed, math.inf)
+    highest = round_significant(1.3 * largest) if 1.3 * largest < limit else floor_significant(max(limit, largest))
+    middle = 0.5 * (magnitudes[0] + largest) if highest > largest else 0.5 * (lowest + largest)
+    other_levels = tuple(sorted({round_significant(lowest), round_significant(middle), highest}))
+    reverse_sign = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
+    reverse_levels = [reverse_sign * x for x in (magnitudes[0], magnitudes[-1])]
     runs = functools.partial(_combined_runs, reach, used=used)
-    experiments = [runs(others_of[reach.imposed], "run", kinds=("other voltages",), voltages=others)]
+    experiments = [runs(names_of_levels[reach.imposed], "run", kinds=("other voltages",), voltages=other_levels)]
     # torques that the table lacks, in the widest gaps above zero, and the largest one that it used
-    most = max(reach.torques, default=0.0)
-    torques = _in_widest_gaps([0.0, *reach.torques], [floor_significant(most)], 4) if most > 0 else (0.0,)
+    largest_torque = max(reach.torques, default=0.0)
+    torques = (
+        _in_widest_gaps([0.0, *reach.torques], [floor_significant(largest_torque)], 4)
+        if largest_torque > 0
+        else (0.0,)
+    )
     if not min(levels) < 0 < max(levels):
-        backward = [0.0, *(way * x for x in torques[1:2])]
-        experiments.append(runs("reverse", "other way", voltages=ends, torques=backward))
-    if most > 0:
-        forward = [-x for x in ends]
-        experiments.append(runs("other torques", "run", voltages=forward, torques=[-way * x for x in torques]))
+        reverse_torques = [0.0, *(reverse_sign * x for x in torques[1:2])]
+        experiments.append(runs("reverse", "other way", voltages=reverse_levels, torques=reverse_torques))
+    if largest_torque > 0:
+        forward_levels = [-x for x in reverse_levels]
+        experiments.append(
+            runs("other torques", "run", voltages=forward_levels, torques=[-reverse_sign * x for x in torques])
+        )
     return tuple(experiments)
 
 
@@ -438,17 +452,17 @@ def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
 # --- possible experiments -----------------------------------------------------------------------------
 
 
-def possible_runs(run: ProposedRuns, does: np.ndarray) -> np.ndarray:
+def possible_runs(run: ProposedRuns, feasible: np.ndarray) -> np.ndarray:
     """True for runs to carry out: slopes, voltages and payloads that the robot can do in all combinations.
 
     Args:
-        does: True for runs that the robot can do, shape (runs,).
+        feasible: True for runs that the robot can do, shape (runs,).
     """
-    possible = np.ones(len(does), bool)
+    possible = np.ones(len(feasible), bool)
     axes = [np.asarray(x) for x in (run.slope, run.voltage, run.payload, run.torque) if len(x)]
-    while possible.any() and not does[possible].all():
+    while possible.any() and not feasible[possible].all():
         levels = [(axis, level) for axis in axes for level in np.unique(axis[possible])]
-        axis, level = max(levels, key=lambda at: float(np.mean(~does[possible & (at[0] == at[1])])))
+        axis, level = max(levels, key=lambda pair: float(np.mean(~feasible[possible & (pair[0] == pair[1])])))
         possible &= axis != level
     if run.steepest and possible.any():
         possible &= axes[0] == axes[0][possible].max()
@@ -465,15 +479,19 @@ def restrict_run(run: ProposedRuns, kept: np.ndarray, temperature: np.ndarray, s
     """
     conditions = {name: getattr(run, name) for name in ("voltage", "slope", "payload", "torque")}
     kept_conditions: dict[str, Any] = {name: tuple(itertools.compress(x, kept)) for name, x in conditions.items()}
-    reach, watch = run.reach, list[Remark]()
+    reach = run.reach
+    watch: list[Remark] = []
     hottest, fastest = float(temperature[kept].max()), float(np.abs(speed[kept]).max())
-    highest, allowed = max(kept_conditions["voltage"]), reach.hot if reach.hot < UNLIMITED else None
+    highest = max(kept_conditions["voltage"])
+    temperature_limit = reach.hot if reach.hot < UNLIMITED else None
     if run.setup is locked:
-        watch.append(Remark("held_motor", temperature=hottest, allowed=allowed, current=highest / reach.resistance))
+        watch.append(
+            Remark("held_motor", temperature=hottest, allowed=temperature_limit, current=highest / reach.resistance)
+        )
     elif run.setup is braked:
-        watch.append(Remark("braked_motor", temperature=hottest, allowed=allowed))
+        watch.append(Remark("braked_motor", temperature=hottest, allowed=temperature_limit))
     elif hottest > reach.hot - WARM:
-        watch.append(Remark("hot_motor", temperature=hottest, allowed=allowed))
+        watch.append(Remark("hot_motor", temperature=hottest, allowed=temperature_limit))
     limit = reach.limit_alone if run.setup in (uncoupled, braked) else reach.limit_geared
     if run.setup in (uncoupled, lifted) and fastest > FAST * limit:
         watch.append(Remark("overspeed", speed=fastest, limit=limit, voltage=highest))

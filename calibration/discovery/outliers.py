@@ -48,10 +48,10 @@ LEVELS = ("configuration", "supply_voltage_V", "slope_deg", "payload_kg", "run_i
 
 @dataclasses.dataclass(frozen=True)
 class OutlierCluster:
-    """Outliers that share a condition, or lie close together along an axis.
+    """Outliers that share a condition, or that are close together along an axis.
 
     Attributes:
-        axis: column, or angle, along which they lie close together.
+        axis: column, or angle, along which they are close together.
         low, high: ends of the cluster on the axis.
         level: the shared level, for a column of words or levels.
         inside, of: number of outliers in the cluster, and number of all outliers.
@@ -97,22 +97,26 @@ def find_cluster(
     return dataclasses.replace(best, p=p) if p < error else None
 
 
-def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray, seed: int) -> OutlierCluster:
+def _cluster_along_axis(
+    name: str, x: np.ndarray, outliers: np.ndarray, pool: np.ndarray, seed: int
+) -> OutlierCluster:
     """Window of an axis with most outliers, compared with random draws of as many rows."""
     low, high = x[pool].min(), x[pool].max()
     random = np.random.default_rng(seed)
-    permutations = np.stack([random.choice(pool, len(mine), replace=False) for _ in range(PERMUTATIONS)])
+    permutations = np.stack([random.choice(pool, len(outliers), replace=False) for _ in range(PERMUTATIONS)])
     clusters: list[OutlierCluster] = []
     for share in WINDOWS:
         width = share * (high - low)
-        (count,), (first,) = _fullest_window(x[mine][None], width)
+        (count,), (first,) = _fullest_window(x[outliers][None], width)
         null, _ = _fullest_window(x[permutations], width)
         p = (1 + int(np.sum(null >= count))) / (1 + PERMUTATIONS)
         if p == 1 / (1 + PERMUTATIONS):  # beyond the resolution of permutations: a normal approximation
             p = min(p, float(ndtr((null.mean() - count) / max(null.std(), 0.3))))
-        inside = x[mine][(x[mine] >= first) & (x[mine] <= first + width)]
+        inside = x[outliers][(x[outliers] >= first) & (x[outliers] <= first + width)]
         p = min(1.0, p * len(WINDOWS))
-        clusters.append(OutlierCluster(name, float(inside.min()), float(inside.max()), "", int(count), len(mine), p))
+        clusters.append(
+            OutlierCluster(name, float(inside.min()), float(inside.max()), "", int(count), len(outliers), p)
+        )
     return min(clusters, key=lambda c: c.p)
 
 
@@ -123,19 +127,21 @@ def _fullest_window(x: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray
     return inside.max(1), x[np.arange(len(x)), inside.argmax(1)]
 
 
-def _clusters_by_level(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray) -> list[OutlierCluster]:
+def _clusters_by_level(name: str, x: np.ndarray, outliers: np.ndarray, pool: np.ndarray) -> list[OutlierCluster]:
     """A cluster for each level of a column, with the hypergeometric p-value of its number of outliers."""
     values = np.unique(x[pool])
     if not 1 < len(values) <= 0.5 * len(pool):
         return []
     from scipy.stats import hypergeom  # takes a second to import, and is rarely needed
 
-    answers = []
+    clusters = []
     for value in values:
-        inside, size = int(np.sum(x[mine] == value)), int(np.sum(x[pool] == value))
-        p = float(hypergeom.sf(inside - 1, len(pool), size, len(mine)))
-        answers.append(OutlierCluster(name, np.nan, np.nan, str(value), inside, len(mine), min(1.0, p * len(values))))
-    return answers
+        inside, size = int(np.sum(x[outliers] == value)), int(np.sum(x[pool] == value))
+        p = float(hypergeom.sf(inside - 1, len(pool), size, len(outliers)))
+        clusters.append(
+            OutlierCluster(name, np.nan, np.nan, str(value), inside, len(outliers), min(1.0, p * len(values)))
+        )
+    return clusters
 
 
 # --- outliers -------------------------------------------------------------------------------------
@@ -168,34 +174,34 @@ def compile_ahead(space: CandidateSpace, runs: Runs) -> Iterator[Callable[[BaseF
     at the prior mean. It yields a function of the base fit that does the same for the predictions of experiments. All
     results are discarded.
     """
-    nothing, none = np.zeros(len(space.coordinates)), fill_slots((), space.settings)
-    mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
+    zeros, empty_slots = np.zeros(len(space.coordinates)), fill_slots((), space.settings)
+    mean = Candidate(empty_slots, zeros, zeros, np.inf, zeros, zeros, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
 
-    looked = threading.Event()
+    is_diagnosed = threading.Event()
 
     def compile_diagnosis() -> None:
         try:
             bases, (linear, _, _) = _diagnose_base(start, runs, space.settings)
         finally:
-            looked.set()
+            is_diagnosed.set()
         if not space.bare.observe.long:
             bootstrap_statistics(
-                space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, space.settings.seed
+                space.bare, zeros[: space.free], linear, space.library.scored, bases, 1, space.settings.seed
             )
 
     def compile_fit() -> None:
         if space.bare.observe.long:  # its readings are linear from here
             return
-        looked.wait()  # needed last: compilation shares two cores with the base fit
-        fit_from_each_start(space.equipped, [nothing], [space.weight], [space.coordinates.indices(none)])
+        is_diagnosed.wait()  # needed last: compilation shares two cores with the base fit
+        fit_from_each_start(space.equipped, [zeros], [space.weight], [space.coordinates.indices(empty_slots)])
 
     def compile_predictions(base: BaseFit) -> None:
         if space.bare.observe.menu:
-            jobs.append(others.submit(predict_menu, base.space, {"": base.candidate}))
+            jobs.append(threads.submit(predict_menu, base.space, {"": base.candidate}))
 
-    with Threads(2) as others:
-        jobs: list[concurrent.futures.Future[Any]] = [others.submit(compile_diagnosis), others.submit(compile_fit)]
+    with Threads(2) as threads:
+        jobs: list[concurrent.futures.Future[Any]] = [threads.submit(compile_diagnosis), threads.submit(compile_fit)]
         yield compile_predictions
     for job in jobs:
         job.result()
@@ -213,30 +219,30 @@ def screen_outliers(base: BaseFit, runs: Runs, settings: Settings) -> Screening:
     clean, excluded = _exclude_gross_errors(base, settings, runs.source)
     bases, diagnosis = _diagnose_base(clean, runs, settings)
     while len(excluded) < allowed:
-        far = _isolated_rows(clean, diagnosis[1], bases, allowed - len(excluded), settings)
-        if not far.size:
+        isolated = _isolated_rows(clean, diagnosis[1], bases, allowed - len(excluded), settings)
+        if not isolated.size:
             break
-        excluded = (*excluded, *map(int, far))
-        clean = _refit_without(clean, far, settings, runs.source)
+        excluded = (*excluded, *map(int, isolated))
+        clean = _refit_without(clean, isolated, settings, runs.source)
         bases, diagnosis = _diagnose_base(clean, runs, settings)
     screened = Screening(clean, excluded, bases, diagnosis)
     cluster = _common_property(screened, runs, settings)
     return screened if cluster is None else Screening(base, (), *_diagnose_base(base, runs, settings), cluster)
 
 
-def _common_property(found: Screening, runs: Runs, settings: Settings) -> OutlierCluster | None:
+def _common_property(screening: Screening, runs: Runs, settings: Settings) -> OutlierCluster | None:
     """Property that the outliers share."""
-    rows, included = np.arange(len(runs)), found.base.space.included
+    rows, included = np.arange(len(runs)), screening.base.space.included
     axes = {a: runs[c] for a, c in (("time", "time_s"), ("order", "order")) if runs.has(c)}
-    angle = found.diagnosed[0].shaft_angle()
+    angle = screening.diagnosed[0].shaft_angle()
     if angle is not None:
         axes["angle of the driving shaft"] = angle[rows] % (2 * np.pi)
     levels = {c: runs[c] for c in LEVELS if runs.has(c)}
-    outliers = np.isin(rows, found.outliers)
+    outliers = np.isin(rows, screening.outliers)
     return find_cluster(outliers, included[rows], axes, levels, settings.outlier_error, settings.seed)
 
 
-def screen_with_effects(found: Screening, left: ScoreTable, runs: Runs, settings: Settings) -> Screening | None:
+def screen_with_effects(screening: Screening, left: ScoreTable, runs: Runs, settings: Settings) -> Screening | None:
     """Excludes rows that are outliers only after effects are added.
 
     None if there are no such rows, or if they form a cluster.
@@ -244,13 +250,13 @@ def screen_with_effects(found: Screening, left: ScoreTable, runs: Runs, settings
     Args:
         left: scores of the residuals of the fit with effects.
     """
-    counting = found.base.space.included.sum() + len(found.outliers)
-    allowed = settings.outliers(int(counting)) - len(found.outliers)
-    far = _isolated_rows(found.base, left, found.bases, allowed, settings)
-    if not far.size or found.cluster is not None:
+    row_count = screening.base.space.included.sum() + len(screening.outliers)
+    allowed = settings.outliers(int(row_count)) - len(screening.outliers)
+    isolated = _isolated_rows(screening.base, left, screening.bases, allowed, settings)
+    if not isolated.size or screening.cluster is not None:
         return None
-    base = _refit_without(found.base, far, settings, runs.source)
-    more = Screening(base, (*found.outliers, *map(int, far)), *_diagnose_base(base, runs, settings))
+    base = _refit_without(screening.base, isolated, settings, runs.source)
+    more = Screening(base, (*screening.outliers, *map(int, isolated)), *_diagnose_base(base, runs, settings))
     return more if _common_property(more, runs, settings) is None else None
 
 
@@ -258,12 +264,12 @@ def _isolated_rows(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int
     """Indices of at most `allowed` rows with one reading whose shift is more significant than any effect or curve."""
     included = base.space.included
     level = -ndtri(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
-    alone = (np.abs(scores.row) * included[:, None]).max(1)
+    row_scores = (np.abs(scores.row) * included[:, None]).max(1)
     smooth = [variable not in bases_room.ORDERS for _, variable in bases_room.family_names(bases)]
-    together = max(np.max(np.abs(scores.single)), np.max(np.asarray(scores.curve)[smooth]))
+    strongest = max(np.max(np.abs(scores.single)), np.max(np.asarray(scores.curve)[smooth]))
     count = 1 if base.space.bare.observe.policy.one_by_one else allowed
-    far = np.argsort(-alone)[: min(count, max(allowed, 0))]
-    return far[(alone[far] >= level) & (alone[far] >= together)]
+    candidates = np.argsort(-row_scores)[: min(count, max(allowed, 0))]
+    return candidates[(row_scores[candidates] >= level) & (row_scores[candidates] >= strongest)]
 
 
 def _diagnose_base(base: BaseFit, runs: Runs, settings: Settings) -> tuple[Bases, Diagnosed]:
@@ -274,12 +280,12 @@ def _diagnose_base(base: BaseFit, runs: Runs, settings: Settings) -> tuple[Bases
     return bases, jax.device_get(diagnose_fit(problem, jnp.asarray(z), space.library.scored, bases))
 
 
-def _refit_without(base: BaseFit, rows: np.ndarray, settings: Settings, where: str) -> BaseFit:
-    again = fit_base(base.space.without(rows), where, base.candidate)
+def _refit_without(base: BaseFit, rows: np.ndarray, settings: Settings, source: str) -> BaseFit:
+    again = fit_base(base.space.without(rows), source, base.candidate)
     return dataclasses.replace(again, unusable=tuple(sorted({*base.unusable, *again.unusable})))
 
 
-def _exclude_gross_errors(base: BaseFit, settings: Settings, where: str) -> tuple[BaseFit, tuple[int, ...]]:
+def _exclude_gross_errors(base: BaseFit, settings: Settings, source: str) -> tuple[BaseFit, tuple[int, ...]]:
     """Excludes rows so far from the fit that they distort it and every score.
 
     They are detected at a robust fit with Cauchy's weights, reweighted every few steps (Holland and Welsch 1977).
@@ -292,19 +298,19 @@ def _exclude_gross_errors(base: BaseFit, settings: Settings, where: str) -> tupl
         return np.max(np.abs((reading - measured) / sd) * (weight > 0), 1)
 
     problem, start, active = space.fit_of(base.candidate.active, base.candidate.z)
-    far = largest_residual(base.reading)
-    if far[included].max() < settings.gross:
+    distance = largest_residual(base.reading)
+    if distance[included].max() < settings.gross:
         return base, ()
     for _ in range(settings.reweightings):
-        robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
+        robust = space.weight / np.sqrt(1 + (distance / settings.cauchy) ** 2)[:, None]
         optima, observations = fit_from_each_start(
             problem, [start], [robust], None if active is None else [active], FEW
         )
-        far, start = largest_residual(np.asarray(observations.reading[0])), np.asarray(optima.z[0])
-    gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
+        distance, start = largest_residual(np.asarray(observations.reading[0])), np.asarray(optima.z[0])
+    gross = included & (distance > settings.gross * max(1.0, float(np.median(distance[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):
         return base, ()
-    return _refit_without(base, np.flatnonzero(gross), settings, where), tuple(map(int, np.flatnonzero(gross)))
+    return _refit_without(base, np.flatnonzero(gross), settings, source), tuple(map(int, np.flatnonzero(gross)))
 
 
 def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:

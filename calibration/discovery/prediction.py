@@ -49,19 +49,19 @@ class HeldOutScore:
         return HeldOutScore({kind: self.by_kind[kind]}, {kind: self.blocks[kind]})
 
     def gain(
-        self, over: HeldOutScore, where: Bool[np.ndarray, "rows channels"] | None = None, fewest: int = 2
+        self, baseline: HeldOutScore, selected: Bool[np.ndarray, "rows channels"] | None = None, fewest: int = 2
     ) -> Gain:
         """Gain of this score over another one, over the readings that both have.
 
         Args:
-            where: True for readings that count. None: all.
+            selected: True for readings that count. None: all.
             fewest: smallest number of blocks whose scatter gives a standard error. Two blocks have one degree of
                 freedom.
         """
         if not self.by_kind:
             return Gain(0.0, np.inf)
-        gains = np.stack([x - over.by_kind[kind] for kind, x in self.by_kind.items()])
-        gains = gains if where is None else np.where(where, gains, np.nan)
+        gains = np.stack([x - baseline.by_kind[kind] for kind, x in self.by_kind.items()])
+        gains = gains if selected is None else np.where(selected, gains, np.nan)
         scored = np.isfinite(gains)
         counts = scored.sum((0, 2))
         rows = counts > 0
@@ -70,10 +70,10 @@ class HeldOutScore:
             return Gain(0.0, np.inf)
         mean = float(np.nansum(gains) / total)
         # Errors by row, and by block of each kind, because readings of a block share the rows that were left out.
-        off = np.nansum(gains, (0, 2)) - mean * counts
-        several = [block for block in self.blocks.values() if len(np.unique(block[block >= 0])) >= fewest]
-        groups = [np.arange(len(rows)), *several]
-        return Gain(mean, max(_clustered_standard_error(off[rows], block[rows]) for block in groups) / total)
+        deviations = np.nansum(gains, (0, 2)) - mean * counts
+        block_groups = [block for block in self.blocks.values() if len(np.unique(block[block >= 0])) >= fewest]
+        groups = [np.arange(len(rows)), *block_groups]
+        return Gain(mean, max(_clustered_standard_error(deviations[rows], block[rows]) for block in groups) / total)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,14 +101,14 @@ def score_readings(
     reading: dict[str, Readings],
     measured: Readings,
     sd: Readings,
-    counts: Bool[np.ndarray, "rows channels"],
+    included: Bool[np.ndarray, "rows channels"],
     kinds: Mapping[str, Columns],
 ) -> HeldOutScore:
     """Scores hold-out predictions by their log density.
 
     Args:
         reading: kind of block → prediction of each row by a fit without its block, NaN for none.
-        counts: True for included readings.
+        included: True for included readings.
         kinds: kind of block → label of each block → mask of its rows.
     """
     by_kind, blocks = {}, {}
@@ -117,10 +117,10 @@ def score_readings(
         block = np.full(len(measured), -1)
         for k, mask in enumerate(blocks_by_name.values()):
             block[mask] = k
-        off = (reading[kind] - measured) / sd
-        off = np.where(np.isfinite(off), off, UNREACHED)
-        density = norm - np.log(sd) - (FREEDOM + 1) / 2 * np.log1p(off**2 / FREEDOM)
-        by_kind[kind] = np.where(counts & (block >= 0)[:, None], density, np.nan)
+        deviation = (reading[kind] - measured) / sd
+        deviation = np.where(np.isfinite(deviation), deviation, UNREACHED)
+        density = norm - np.log(sd) - (FREEDOM + 1) / 2 * np.log1p(deviation**2 / FREEDOM)
+        by_kind[kind] = np.where(included & (block >= 0)[:, None], density, np.nan)
         blocks[kind] = block
     return HeldOutScore(by_kind, blocks, reading)
 
@@ -142,8 +142,8 @@ def candidate_key(candidate: Candidate) -> tuple[Names, bytes]:
 def score_predictions(space: CandidateSpace, runs: Runs, reading: Columns) -> HeldOutScore:
     """Hold-out scores of readings that were predicted for each kind of block."""
     data, rows = space.equipped.data, len(runs)
-    measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    return score_readings(reading, measured, sd, counts, blocks_room.predictable_blocks(runs, space.bare))
+    measured, sd, included = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
+    return score_readings(reading, measured, sd, included, blocks_room.predictable_blocks(runs, space.bare))
 
 
 def cached_hold_out_score(
@@ -248,12 +248,13 @@ def readings_of_rows(
         unreachable = fitted.problem.observe.unreachable(np.asarray(observation.status))[: len(runs), None]
         return np.where(unreachable, np.nan, np.asarray(observation.reading)[: len(runs)])
 
-    first = last = before.held_out(kinds) if known_before is None else known_before
+    held_out_before = held_out_after = before.held_out(kinds) if known_before is None else known_before
     if after is not None:
-        last = after.held_out(kinds) if known_after is None else known_after
+        held_out_after = after.held_out(kinds) if known_after is None else known_after
     stated_reading = fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z)))
     fitted = fitted_reading(before)
     return ReadingsOfRows(
         runs.measured(), sd[: len(runs)], stated_reading, fitted, fitted if after is None else fitted_reading(after),
-        {kind: (first[kind], last[kind]) for kind in kinds}, {kind: tuple(names) for kind, names in kinds.items()},
+        {kind: (held_out_before[kind], held_out_after[kind]) for kind in kinds},
+        {kind: tuple(names) for kind, names in kinds.items()},
     )  # fmt: skip

@@ -43,8 +43,8 @@ class Projection:
 
     def __call__(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A = Cᵀ (I - P) C and b = -Cᵀ (I - P) e. Coefficients a of the columns C reduce χ² by 2 bᵀa - aᵀA a."""
-        inside = self.half[:, : len(columns)] @ columns
-        return columns.T @ columns - inside.T @ inside, -columns.T @ self.left[: len(columns)]
+        absorbed = self.half[:, : len(columns)] @ columns
+        return columns.T @ columns - absorbed.T @ absorbed, -columns.T @ self.left[: len(columns)]
 
     def explained(self, columns: np.ndarray) -> tuple[float, float]:
         """Decrease of χ² by all columns, and their sensitivity that the free parameters leave [σ²]."""
@@ -58,8 +58,8 @@ class Projection:
             rows: readings of the columns. None: the first ones.
         """
         rows = slice(len(columns)) if rows is None else rows
-        inside = self.half[:, rows] @ columns
-        return np.sum(columns**2, 0) - np.sum(inside**2, 0), columns.T @ self.left[rows]
+        absorbed = self.half[:, rows] @ columns
+        return np.sum(columns**2, 0) - np.sum(absorbed**2, 0), columns.T @ self.left[rows]
 
     def roots(self, columns: np.ndarray, rows: np.ndarray | slice | None = None) -> np.ndarray:
         """Square root of the score of each column [σ]. 0 for columns that the free parameters can imitate."""

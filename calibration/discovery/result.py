@@ -318,11 +318,11 @@ class DiscoveryResult:
         main = next(iter(readings.held_out.values()), None)
         for k, channel in enumerate(self.channels):
             column, unit = channel.column, channel.factor
-            shown = {column: readings.measured, channel.sd_column: readings.sd}
-            shown |= {f"before_{column}": readings.before, f"after_{column}": readings.after}
+            columns_of_channel = {column: readings.measured, channel.sd_column: readings.sd}
+            columns_of_channel |= {f"before_{column}": readings.before, f"after_{column}": readings.after}
             if main is not None:
-                shown |= {f"held_out_before_{column}": main[0], f"held_out_after_{column}": main[1]}
-            table |= {name: x[:, k] / unit for name, x in shown.items()}
+                columns_of_channel |= {f"held_out_before_{column}": main[0], f"held_out_after_{column}": main[1]}
+            table |= {name: x[:, k] / unit for name, x in columns_of_channel.items()}
             for when, simulated in (("before", readings.before), ("after", readings.after)):
                 off = simulated[:, k] - readings.measured[:, k]
                 table[f"residual_{when}_{channel.name}_sigma"] = off / readings.sd[:, k]

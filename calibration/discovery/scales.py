@@ -73,8 +73,8 @@ SLIPPERY = 16.0
 #: With 1, 5 of 26 random rigs with an effect of at most three ordinary sizes got no name because of its size
 #: (benchmarks/rigs.py). The factor does not apply to mass, which is weighed.
 UNKNOWN = 4.0
-#: Largest error of an instrument, as a share of the channel's rms reading: a larger one would be noticed (47 A on
-#: readings of 114 A are no ammeter's offset).
+#: Largest error of an instrument, as a share of the channel's rms reading. A larger one would be noticed: 47 A on
+#: readings of 114 A are no ammeter's offset.
 MOST_OFF = 0.25
 #: Least size of an instrument's readings for its errors, as a share of those at rated load and speed. A motor without
 #: load draws little of its ammeter's range: 0.4 A on readings of 0.6 A is an offset of a meter for 20 A.
@@ -105,17 +105,17 @@ def scale_library(robot: Robot, conditions: Conditions, library: Library, turned
     # of conditions that vary in time, those in the middle of each run
     steady = jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
     signals = travel_of_rows(robot, steady)[1]
-    nominal, effect_signals = _nominal_signals()
-    sized = {}
+    nominal, nominal_signals = _nominal_signals()
+    scaled = {}
     for name, kind in library.items():
         if not effect_applies(kind, robot):
             continue
-        sized[name] = _scale_effect(
+        scaled[name] = _scale_effect(
             kind,
             (robot, _signals_at_angle(signals, kind, turned)),
-            (nominal, _signals_at_angle(effect_signals, kind)),
+            (nominal, _signals_at_angle(nominal_signals, kind)),
         )
-    return sized
+    return scaled
 
 
 def output_rotation(runs: Runs, robot: Robot) -> float:
@@ -127,13 +127,13 @@ def output_rotation(runs: Runs, robot: Robot) -> float:
     return math.nan
 
 
-def _signals_at_angle(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
+def _signals_at_angle(signals: Signals, kind: type[Effect], angle: float | None = None) -> Signals:
     """Signals at which an effect that depends on position is evaluated, by default at its reference angle. Unchanged
     for other effects.
     """
     if kind.driver != "position" or kind.memory_size is None:
         return signals
-    positions = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if turned is None else turned)
+    positions = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if angle is None else angle)
     return dataclasses.replace(signals, memory={**signals.memory, kind.name: positions})
 
 
@@ -166,40 +166,40 @@ def _rms_size(x: object) -> float:
     return float(largest * np.sqrt(np.mean((sizes / largest) ** 2))) if sizes.size else math.nan
 
 
-def _size_ratio(mine: float, theirs: float) -> float:
+def _size_ratio(size: float, reference: float) -> float:
     """Ratio of two sizes. 1 if one of them is NaN."""
-    return mine / theirs if math.isfinite(mine) and math.isfinite(theirs) else 1.0
+    return size / reference if math.isfinite(size) and math.isfinite(reference) else 1.0
 
 
-def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot, Signals]) -> type[Effect]:
+def _scale_effect(kind: type[Effect], rig: tuple[Robot, Signals], nominal: tuple[Robot, Signals]) -> type[Effect]:
     """Effect class with priors scaled from one robot to another."""
     effect = kind()
     shape, amplitude = free_shape_parameter(effect), amplitude_of(effect)
     stretch = 1.0
     if shape is not None:
-        with_ = SCALED_WITH.get(shape.spec.unit)
+        scaling_signal = SCALED_WITH.get(shape.spec.unit)
         if shape.spec.unit == "rad/s":
             output = kind.balance in AT_THE_OUTPUT
-            with_ = (lambda s: s.speed_wheel) if output else (lambda s: s.speed_motor)
-        if with_ is not None:
-            stretch = _size_ratio(_rms_size(with_(mine[1])), _rms_size(with_(theirs[1])))
-    grown = effect if shape is None else params.replace(effect, {shape.name: jnp.asarray(stretch * shape.value)})
-    factor, share = 1.0, _unit_share(grown, *mine)
+            scaling_signal = (lambda s: s.speed_wheel) if output else (lambda s: s.speed_motor)
+        if scaling_signal is not None:
+            stretch = _size_ratio(_rms_size(scaling_signal(rig[1])), _rms_size(scaling_signal(nominal[1])))
+    stretched = effect if shape is None else params.replace(effect, {shape.name: jnp.asarray(stretch * shape.value)})
+    factor, share = 1.0, _unit_share(stretched, *rig)
     if kind.balance == "sensor":
-        share = min(share, _unit_share(grown, mine[0], _scale_to_rated_load(*mine)) / LEAST_SHOWN)
-    if amplitude.spec.unit == BALANCES[kind.balance][0]:  # by its own size, even if operating points show none
+        share = min(share, _unit_share(stretched, rig[0], _scale_to_rated_load(*rig)) / LEAST_SHOWN)
+    if amplitude.spec.unit == BALANCES[kind.balance][0]:  # even if the term is zero at the operating points
         full_scale = WHOLE[kind.balance]
-        factor = _size_ratio(_rms_size(full_scale(*mine)), _rms_size(full_scale(*theirs)))
+        factor = _size_ratio(_rms_size(full_scale(*rig)), _rms_size(full_scale(*nominal)))
     elif amplitude.spec.unit != "-":
-        factor = _size_ratio(_unit_share(effect, *theirs), share)
-    slips = kind.balance == "slip" and amplitude.spec.unit == "-"
-    factor *= SLIPPERY if slips else 1.0 if kind.balance == "mass" else UNKNOWN
+        factor = _size_ratio(_unit_share(effect, *nominal), share)
+    is_slip_share = kind.balance == "slip" and amplitude.spec.unit == "-"
+    factor *= SLIPPERY if is_slip_share else 1.0 if kind.balance == "mass" else UNKNOWN
     limits = factor
     if kind.balance != "sensor":
-        rated = _unit_share(grown, mine[0], _scale_to_rated_load(*mine))
+        rated = _unit_share(stretched, rig[0], _scale_to_rated_load(*rig))
         limits = factor * min(1.0, _size_ratio(share, rated))
     else:
-        low, high = amplitude_of(grown).spec.bounds
+        low, high = amplitude_of(stretched).spec.bounds
         limits = min(factor, MOST_OFF / (max(-low, high) * share))
     return scaled_effect(kind, (float(factor), float(stretch), float(limits)))
 
@@ -215,11 +215,11 @@ def _scale_to_rated_load(robot: Robot, signals: Signals) -> Signals:
     if not (rig.shows_voltage and current and speed and volts and float(motor.resistance)):
         return signals
     volts = max(volts, motor.voltage_limit or 0.0)
-    load = min(float(robot.current_continuous), LOADED * volts / float(motor.resistance)) / current
-    fast = min(motor.speed_limit, RUNNING * volts / float(motor.torque_constant)) / speed
-    grown = {name: max(load, 1.0) * getattr(signals, name) for name in LOADS}
-    grown |= {name: max(fast, 1.0) * getattr(signals, name) for name in SPEEDS}
-    return dataclasses.replace(signals, **grown)
+    load_factor = min(float(robot.current_continuous), LOADED * volts / float(motor.resistance)) / current
+    speed_factor = min(motor.speed_limit, RUNNING * volts / float(motor.torque_constant)) / speed
+    scaled = {name: max(load_factor, 1.0) * getattr(signals, name) for name in LOADS}
+    scaled |= {name: max(speed_factor, 1.0) * getattr(signals, name) for name in SPEEDS}
+    return dataclasses.replace(signals, **scaled)
 
 
 def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
@@ -255,11 +255,11 @@ def visible_effects(
         either_way: True if there are forward and backward runs, see `goes_both_ways`.
         at_duties: True if some runs have a duty below 1, see `has_partial_duty`.
     """
-    have = {e.name for e in robot.effects}
+    existing = {e.name for e in robot.effects}
     return tuple(
         effect()
         for name, effect in library.items()
-        if name not in have
+        if name not in existing
         and kind.shows(effect)
         and effect_applies(effect, robot)
         and (either_way or not effect.needs_reverse)

@@ -32,7 +32,7 @@ UNSETTLED = 0.05
 #: Prior sd of a curve's columns in a fit with the free parameters [σ]: wide, but it keeps their rank.
 WIDE = 30.0
 #: Coordinates are padded to a multiple of this.
-FILLED = 72
+COORDINATE_MULTIPLE = 72
 #: Range of the ratio of the true to an estimated sd.
 UNSURE = 0.3, 4.0
 #: Replicates in one batch of the bootstrap.
@@ -96,20 +96,20 @@ class ProjectionFactors(eqx.Module):
 
 def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     """Scores of each instance, pair of instances, curve and reading."""
-    g, fit = linear.signatures, ProjectionFactors.of(linear)
-    dots, products = fit.projected(g)
-    total_norm = jnp.sum(g**2, 0)
+    signatures, fit = linear.signatures, ProjectionFactors.of(linear)
+    dots, products = fit.projected(signatures)
+    total_norm = jnp.sum(signatures**2, 0)
     norm2 = jnp.maximum(jnp.diag(products), 0.0)
     is_visible = norm2 > ABSORBED**2 * jnp.maximum(total_norm, 1e-300)
     norm = jnp.sqrt(jnp.where(is_visible, norm2, 1.0))
     single = jnp.where(is_visible, -dots / norm, 0.0)
-    both_seen = is_visible[:, None] & is_visible
-    cosine = jnp.where(both_seen, products / (norm[:, None] * norm), 0.0)
-    apart = jnp.where(both_seen, 1 - cosine**2, 0.0)
+    both_visible = is_visible[:, None] & is_visible
+    cosine = jnp.where(both_visible, products / (norm[:, None] * norm), 0.0)
+    separation = jnp.where(both_visible, 1 - cosine**2, 0.0)
     pair_scores = (single[:, None] ** 2 + single**2 - 2 * cosine * single[:, None] * single) / jnp.maximum(
-        apart, 1e-9
+        separation, 1e-9
     )
-    pair = jnp.where(apart > 1e-2, pair_scores, 0.0)
+    pair = jnp.where(separation > 1e-2, pair_scores, 0.0)
 
     leverage = jnp.sum(fit.half**2, 0)
     row = jnp.where(leverage < 1 - 1e-6, fit.left / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
@@ -216,10 +216,10 @@ def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Str
 
     The coordinates are padded with ones that do not influence the readings, so that only a few sizes are compiled.
     """
-    filled = np.zeros((linear.readings, -linear.jacobian.shape[1] % FILLED))
-    jacobian, residual = augment_with_columns(linear, filled)
-    wide: Any = {"jacobian": jacobian, "residual": residual, "signals": None}
-    return _scores_and_strongest(dataclasses.replace(jax.tree.map(np.asarray, linear), **wide), bases)
+    padding = np.zeros((linear.readings, -linear.jacobian.shape[1] % COORDINATE_MULTIPLE))
+    jacobian, residual = augment_with_columns(linear, padding)
+    padded: Any = {"jacobian": jacobian, "residual": residual, "signals": None}
+    return _scores_and_strongest(dataclasses.replace(jax.tree.map(np.asarray, linear), **padded), bases)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -251,13 +251,13 @@ def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.n
     Args:
         extra: columns over the readings, shape (readings, columns).
     """
-    jacobian, (readings, wide) = np.asarray(linear.jacobian), extra.shape
+    jacobian, (readings, added) = np.asarray(linear.jacobian), extra.shape
     total, free = jacobian.shape
-    augmented = np.zeros((total + wide, free + wide))
+    augmented = np.zeros((total + added, free + added))
     augmented[:total, :free] = jacobian
     augmented[:readings, free:] = extra
-    augmented[total:, free:] = np.eye(wide)
-    return augmented, np.concatenate([np.asarray(linear.residual), np.zeros(wide)])
+    augmented[total:, free:] = np.eye(added)
+    return augmented, np.concatenate([np.asarray(linear.residual), np.zeros(added)])
 
 
 def statistics_with_columns(
@@ -271,17 +271,17 @@ def statistics_with_columns(
         extra: columns over the readings, shape (readings, columns).
         names: place of each column.
     """
-    wide: tuple[Any, Any] = augment_with_columns(linear, extra)
-    scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
-    balances = np.array([n[0] for b in bases for n in b.names])
-    deviate = np.where(np.isin(balances, list(names)), -np.inf, scores.curve)
-    nothing = jnp.asarray(-jnp.inf)
+    augmented: tuple[Any, Any] = augment_with_columns(linear, extra)
+    scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=augmented[0], residual=augmented[1]), bases)
+    places = np.array([n[0] for b in bases for n in b.names])
+    deviate = np.where(np.isin(places, list(names)), -np.inf, scores.curve)
+    untested = jnp.asarray(-jnp.inf)
     statistics = StrongestStatistics(
         single=np.max(np.abs(scores.single)),
         pair=np.max(np.asarray(scores.pair)),
         curve=np.max(deviate, initial=-np.inf),
-        chi2=nothing,
-        white=nothing,
+        chi2=untested,
+        white=untested,
         settled=jnp.asarray(True),
     )
     return statistics, deviate

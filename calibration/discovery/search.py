@@ -97,13 +97,13 @@ def search_effects(
         ):
             break
         progress(progress_remark("more effects", best.effects))
-        more = _extend_set(space, best, diagnosis, base, left)
+        extensions = _extend_set(space, best, diagnosis, base, left)
         # It has to explain clearly more than every candidate with one effect fewer.
         fewer_costs = [c.cost for c in ladder if c.plausible and len(c.effects) == len(best.effects)]
-        best = _best_plausible(more)
+        best = _best_plausible(extensions)
         if best is not None and not 2 * (min(fewer_costs, default=np.inf) - best.cost) >= space.settings.needed**2:
             best = None
-        ladder += more
+        ladder += extensions
         if best is not None:
             fewer = refit_without_each(space, best)
             ladder += fewer
@@ -113,13 +113,13 @@ def search_effects(
     return SearchResult(tuple(ladder), diagnosed, diagnosis)
 
 
-def best_of_each_size(found: SearchResult) -> list[Candidate]:
-    """Best plausible candidate with each number of effects, up to that of the proposal."""
-    if found.best is None:
+def best_of_each_size(searched: SearchResult) -> list[Candidate]:
+    """Best plausible candidate with each number of effects, up to the size of the proposal."""
+    if searched.best is None:
         return []
-    sizes = range(1, len(found.best.effects))
-    smaller = [_best_plausible([c for c in found.ladder if len(c.effects) == size]) for size in sizes]
-    return [*(c for c in smaller if c is not None), found.best]
+    sizes = range(1, len(searched.best.effects))
+    smaller = [_best_plausible([c for c in searched.ladder if len(c.effects) == size]) for size in sizes]
+    return [*(c for c in smaller if c is not None), searched.best]
 
 
 def single_p_value(gain: float, null: np.ndarray) -> float:
@@ -142,9 +142,9 @@ def refit_without_each(space: CandidateSpace, best: Candidate, ladder: Sequence[
     """
     fewer = [fill_slots([n for n in best.effects if n != name], space.settings) for name in best.effects]
     fits = {c.active: c for c in ladder}
-    new = [(w, start_of_fit(space, best, w)) for w in fewer if w not in fits]
-    fits |= {c.active: c for c in fit_candidates(space, new)}
-    return [fits[w] for w in fewer]
+    unfitted = [(active, start_of_fit(space, best, active)) for active in fewer if active not in fits]
+    fits |= {c.active: c for c in fit_candidates(space, unfitted)}
+    return [fits[active] for active in fewer]
 
 
 def _names_by_score(space: CandidateSpace, scores: ScoreTable, last: Sequence[str] = ()) -> list[str]:
@@ -224,18 +224,18 @@ def screen_by_weak_form(space: CandidateSpace) -> WeakFormScreening | None:
     projected = columns - q @ (q.T @ columns)
     norm = np.linalg.norm(projected, axis=0)
     is_visible = norm > ABSORBED * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    ways = np.where(is_visible, projected / np.where(is_visible, norm, 1.0), 0.0)
-    single = -ways.T @ equations.residual
-    none = np.zeros(0)
+    directions = np.where(is_visible, projected / np.where(is_visible, norm, 1.0), 0.0)
+    single = -directions.T @ equations.residual
+    empty = np.zeros(0)
     amplitude = np.where(is_visible, single / np.where(is_visible, norm, 1.0), 0.0)
-    parts: tuple[Any, ...] = (single, amplitude, norm, none, ways.T @ ways, *[none] * 4)
-    scores = ScoreTable(*parts)
+    columns_of_table: tuple[Any, ...] = (single, amplitude, norm, empty, directions.T @ directions, *[empty] * 4)
+    scores = ScoreTable(*columns_of_table)
     random = np.random.default_rng(space.settings.seed)
-    null = np.max(np.abs(random.standard_normal((space.settings.replicates, len(ways))) @ ways), 1)
+    null = np.max(np.abs(random.standard_normal((space.settings.replicates, len(directions))) @ directions), 1)
     sd = np.sqrt(np.diag(np.linalg.inv(equations.jacobian.T @ equations.jacobian)))
     cost = np.asarray(0.5 * np.sum(equations.residual**2))
-    of_fit: tuple[Any, ...] = (equations.z, sd, np.zeros((0, 0)), cost, np.zeros(()), np.asarray(True), np.asarray(0))
-    optimum = with_slots(Optimum(*of_fit), space)
+    fields: tuple[Any, ...] = (equations.z, sd, np.zeros((0, 0)), cost, np.zeros(()), np.asarray(True), np.asarray(0))
+    optimum = with_slots(Optimum(*fields), space)
     base = dataclasses.replace(candidate_of_fit(space, fill_slots((), space.settings), optimum), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     return WeakFormScreening(base, slides, scores, len(equations.signatures), null)

@@ -10,12 +10,12 @@ from calibration.data.input_errors import SEEDS, stated_count
 from calibration.inference.observers import Observer
 
 #: Family-wise error of the test for a missing effect, divided among the kinds of evidence: single effects, curves,
-#: pairs, χ², and for residuals in order of time also their memory (`white`).
+#: pairs and χ². Residuals in order of time also have their memory (`white`).
 SHARES = {
     ("single", "curve", "pair", "chi2"): (0.03, 0.01, 0.004, 0.006),
     ("single", "curve", "pair", "chi2", "white"): (0.03, 0.01, 0.004, 0.003, 0.003),
 }
-#: Verdicts with a missing effect, none of which is established.
+#: Verdicts that find a discrepancy but establish no effect.
 WITHOUT_NAME = ("mechanism", "place")
 #: Margin above its threshold at which a statistic rejects a fit with effects. A residual effect of two sigmas right
 #: on the threshold would otherwise flip the verdict, at a family-wise error of about 1 %.

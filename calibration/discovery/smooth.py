@@ -22,11 +22,11 @@ from mmrjax.effects.curve import ORDINATES, ordinate_weights
 LENGTHS, SIZES = (1.0, 1.5, 2.5, 4.0), tuple(np.geomspace(0.3, 300.0, 25))
 #: Terms of each variable of a surface, and the decrease of their prior sd with the degree (in logarithms).
 PRODUCT, FALL = 4, 0.35
-#: Margin for the start and end of a temporary change, as a share of its duration.
-BESIDE = 0.3
+#: Margin before and after a temporary change, as a share of its duration.
+MARGIN = 0.3
 #: Width of a condition's level for that margin, as a share of the condition's range.
 NARROW = 0.05
-#: Prior sd of a curve's level and trend, over that of its shape.
+#: Prior sd of a curve's level and trend, relative to the prior sd of its shape.
 WIDE = 3.0
 #: Number of plotted points of a curve.
 POINTS = 61
@@ -61,7 +61,7 @@ class SmoothCurve:
     evidence: float
 
     @property
-    def happening(self) -> bool:
+    def temporary(self) -> bool:
         """True if it describes a temporary change."""
         return window_from_name(self.variable) is not None
 
@@ -85,7 +85,7 @@ def _basis_functions(variable: str, x: np.ndarray, low: float, high: float) -> n
 _weights: Callable[..., Array] = compiled(ordinate_weights)
 
 
-def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> SmoothCurve:
+def fit_smooth_curve(linear: Linearization, balance: str, variable: str, included: np.ndarray) -> SmoothCurve:
     """Smooth curve over a variable in a balance, fitted at the linearised base fit.
 
     The ordinates are a Gaussian process with covariance s² exp(-½ (Δ/l)²) at distance Δ. A level and a trend, WIDE
@@ -93,71 +93,74 @@ def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts:
     (Rasmussen and Williams 2006, eqs. (2.39), (5.8)). A wave has independent sine and cosine.
 
     Args:
-        counts: True for included rows, shape (rows,).
+        included: True for included rows, shape (rows,).
     """
-    happens = window_from_name(variable)
-    axis = variable if happens is None else happens.axis
-    (x, way), counts = linear.curve_variable(balance, axis), linear.at_points(counts)
-    low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
-    if happens is not None:
-        beside = BESIDE * max(happens.high - happens.low, NARROW * (high - low))
-        low, high = happens.low - beside, happens.high + beside
+    window = window_from_name(variable)
+    axis = variable if window is None else window.axis
+    (x, way), included = linear.curve_variable(balance, axis), linear.at_points(included)
+    low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[included].min()), float(x[included].max()))
+    if window is not None:
+        margin = MARGIN * max(window.high - window.low, NARROW * (high - low))
+        low, high = window.low - margin, window.high + margin
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
-        high = low + max(abs(low), 1.0)  # a constant variable: only an offset can be seen
+        high = low + max(abs(low), 1.0)  # a constant variable shows only an offset
     basis = _basis_functions(variable, x, low, high)
     a, b = Projection.of(linear)(place_signature(linear, balance, way[:, None] * basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
-    roots = [np.eye(2)] if variable in ORDERS else [_prior_root(length, happens is not None) for length in LENGTHS]
+    roots = [np.eye(2)] if variable in ORDERS else [_prior_root(length, window is not None) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
     for root, sigmas in itertools.product(roots, SIZES):
         scale = sigmas * size
-        inner, pull = scale**2 * root.T @ a @ root, scale * root.T @ b
-        information = np.eye(len(root)) + inner
+        prior_information, pull = scale**2 * root.T @ a @ root, scale * root.T @ b
+        information = np.eye(len(root)) + prior_information
         z = np.linalg.solve(information, pull)
         evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(information)[1]
         if evidence > best[0]:
             covariance = np.linalg.inv(information)
-            explained, freedom = float(2 * pull @ z - z @ inner @ z), float(np.trace(covariance @ inner))
+            explained, freedom = (
+                float(2 * pull @ z - z @ prior_information @ z),
+                float(np.trace(covariance @ prior_information)),
+            )
             best = evidence, (scale, root, z, covariance, explained, freedom, 2 * float(evidence))
     return SmoothCurve(f"curve_{balance}_{axis}", variable, low, high, *best[1])
 
 
-def _prior_root(length: float, happening: bool) -> np.ndarray:
+def _prior_root(length: float, is_temporary: bool) -> np.ndarray:
     """L of the prior covariance L Lᵀ of the ordinates for one correlation length [spacings of the ordinates]. A
     temporary change is zero at its ends.
     """
     across = np.linspace(-1.0, 1.0, len(ORDINATES))
     distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
     covariance = np.exp(-0.5 * (distance / length) ** 2) + 1e-6 * np.eye(len(ORDINATES))
-    if not happening:
+    if not is_temporary:
         covariance += WIDE**2 * (1 + np.outer(across, across))
     root = np.linalg.cholesky(covariance)
-    if happening:
+    if is_temporary:
         root[[0, -1]] = 0.0
     return root
 
 
 def fit_smooth_surface(
-    linear: Linearization, balance: str, variables: tuple[str, str], counts: np.ndarray, project: Projection
+    linear: Linearization, balance: str, variables: tuple[str, str], included: np.ndarray, project: Projection
 ) -> tuple[float, np.ndarray]:
     """Smooth discrepancy over two variables, as a sum of products of Legendre polynomials.
 
     The prior sd of a term decreases with its degree. The common size of all terms maximises the evidence.
 
     Args:
-        counts: True for included rows, shape (rows,).
+        included: True for included rows, shape (rows,).
 
     Returns:
         Evidence as in `SmoothCurve`, and the sensitivity of the readings to each term, scaled by its prior sd, shape
         (readings, terms).
     """
-    weight = linear.at_points(counts).astype(float)
+    weight = linear.at_points(included).astype(float)
     bases, ways = zip(*(linear.curve_variable(balance, v) for v in variables), strict=True)
-    sides = [
+    polynomials = [
         legendre.legvander(scale_to_unit_range(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
         for x in bases
     ]
-    shapes = ways[0][:, None] * (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.points, -1)
+    shapes = ways[0][:, None] * (polynomials[0][:, :, None] * polynomials[1][:, None, :]).reshape(linear.points, -1)
     columns = place_signature(linear, balance, shapes)
     a, b = project(columns)
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))

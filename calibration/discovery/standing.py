@@ -53,42 +53,42 @@ def equation_of_place(place: str) -> str:
 
 
 def judge_names(
-    beside: BaseCurve,
+    base_curve: BaseCurve,
     searched: SearchResult,
     proposed: Proposed | None = None,
     blocks: Sequence[np.ndarray] = (),
 ) -> NameSupport:
-    """Tests which effects of a candidate may be named: of the best candidate of a search, or of a given proposal.
+    """Tests which effects may be named: those of the best candidate of a search, or of a proposal.
 
     A set that leaves no significant residuals is compared with curves. Another set is compared with a single curve.
     Then each effect is tested on its own (`judge_each_name`).
 
     Args:
-        beside: the base fit, its diagnosis and the smooth curve of its discrepancy.
+        base_curve: the base fit, its diagnosis and the smooth curve of its discrepancy.
         proposed: a candidate instead of the search's best, and its diagnosis.
         blocks: mask of the rows of each block that is left out in turn, shape (rows,).
     """
     best, after = (searched.best, searched.diagnosis) if proposed is None else proposed
     if best is None or after is None:
         return NameSupport(False, "implausible")
-    better = _better_but_implausible(beside, searched.best or best, searched.ladder)
+    better = _better_but_implausible(base_curve, searched.best or best, searched.ladder)
     adequate = not after.test.rejected_with_margin
     if len(best.effects) == 1 and adequate and better:
         return NameSupport(False, "larger", better[0].effects)
-    support = _compare_with_curves(beside, best) if adequate else _compare_with_single_curve(beside, best)
-    fits = dataclasses.replace(searched, ladder=(beside.base, *searched.ladder))
-    tests = judge_each_name(beside, best, fits, after, blocks, better)
+    support = _compare_with_curves(base_curve, best) if adequate else _compare_with_single_curve(base_curve, best)
+    fits = dataclasses.replace(searched, ladder=(base_curve.base, *searched.ladder))
+    tests = judge_each_name(base_curve, best, fits, after, blocks, better)
     if support.stands:
         stands = any(t.established for t in tests)
         support = NameSupport(stands, "beside" if stands else "none by itself")
     return dataclasses.replace(support, tests=tests)
 
 
-def _better_but_implausible(beside: BaseCurve, best: Candidate, ladder: Sequence[Candidate]) -> list[Candidate]:
+def _better_but_implausible(base_curve: BaseCurve, best: Candidate, ladder: Sequence[Candidate]) -> list[Candidate]:
     """Candidates with more evidence that only their size excludes, the best first."""
-    least = evidence_of_names(beside.space, beside.base, best) + beside.settings.preferred
+    least = evidence_of_names(base_curve.space, base_curve.base, best) + base_curve.settings.preferred
     evidence = {
-        c.active: (evidence_of_names(beside.space, beside.base, c), c)
+        c.active: (evidence_of_names(base_curve.space, base_curve.base, c), c)
         for c in ladder
         if c.simulated and np.isfinite(c.cost) and len(c.effects) <= len(best.effects) and not c.plausible
     }
@@ -122,21 +122,21 @@ def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate) -
     return 2 * (base.cost - best.cost) - cost_of_names(space, best)
 
 
-def _compare_with_curves(beside: BaseCurve, best: Candidate) -> NameSupport:
+def _compare_with_curves(base_curve: BaseCurve, best: Candidate) -> NameSupport:
     """Compares names with one smooth curve: of one variable anywhere, or of two variables in a balance with several
     names.
     """
-    space, bases, linear = beside.space, beside.bases, beside.left.linear
+    space, bases, linear = base_curve.space, base_curve.bases, base_curve.left.linear
     equations = [_equation_of_effect(space, effect) for effect in best.effects]
     places = {place for place, _ in bases_room.family_names(bases)}
     curves = _curve_evidence(space, linear, bases, {e for e in places if equations.count(e) > 1})
     if not curves:
         return NameSupport(True)
-    curve, best_place = max(curves)
+    curve_evidence, best_place = max(curves)
     # Curves are linear at the base, so names get the better of their fit and of their linear gain there.
-    fall = max(2 * (beside.base.cost - best.cost), _linear_explanation(space, best, linear))
-    names = fall - cost_of_names(space, best)
-    if curve - 2 * math.log(len(curves)) > names + beside.settings.preferred:
+    explained = max(2 * (base_curve.base.cost - best.cost), _linear_explanation(space, best, linear))
+    names_evidence = explained - cost_of_names(space, best)
+    if curve_evidence - 2 * math.log(len(curves)) > names_evidence + base_curve.settings.preferred:
         return NameSupport(False, "better curve", best.effects, (best_place,))
     return NameSupport(True)
 
@@ -150,19 +150,19 @@ def _curve_evidence(
     Args:
         equation: only curves in its places. Empty: in all.
     """
-    included, offered = space.included, dict.fromkeys(bases_room.family_names(bases))
-    variables = {variable for _, variable in offered}
-    known_curves = [
+    included, families = space.included, dict.fromkeys(bases_room.family_names(bases))
+    variables = {variable for _, variable in families}
+    varying = [
         v
         for v in (*bases_room.VARIABLES, *bases_room.ORDERS)
         if v in variables and _variable_varies(linear, v, included)
     ]
     curves = []
-    for place, variable in offered:
-        if variable in known_curves and (not equation or equation_of_place(place) == equation):
+    for place, variable in families:
+        if variable in varying and (not equation or equation_of_place(place) == equation):
             curve = smooth.fit_smooth_curve(linear, place, variable, included)
             curves.append((curve.evidence, PlacedCurve(place, (variable,))))
-    project, varied = Projection.of(linear), [v for v in VARIABLES if v in known_curves]
+    project, varied = Projection.of(linear), [v for v in VARIABLES if v in varying]
     for place, pair in itertools.product(sorted(crowded), itertools.combinations(varied, 2)):
         evidence, _ = smooth.fit_smooth_surface(linear, place, pair, included, project)
         curves.append((evidence, PlacedCurve(place, pair)))
@@ -193,9 +193,9 @@ def _equation_of_effect(space: CandidateSpace, effect: str) -> str:
     return equation_of_place(space.library[effect].channel or space.library[effect].balance)
 
 
-def _compare_with_single_curve(beside: BaseCurve, best: Candidate) -> NameSupport:
+def _compare_with_single_curve(base_curve: BaseCurve, best: Candidate) -> NameSupport:
     """Tests if a single smooth curve fits the data where the effects of a candidate do not."""
-    left, bases = beside.left, beside.bases
+    left, bases = base_curve.left, base_curve.bases
     names = bases_room.family_names(bases)
     strongest: dict[str, int] = {}  # family of each place, the most significant place first
     for index in np.argsort(-np.asarray(left.scores.curve)):
@@ -205,28 +205,28 @@ def _compare_with_single_curve(beside: BaseCurve, best: Candidate) -> NameSuppor
         statistics, _ = statistics_with_columns(left.linear, bases, columns, [place])
         if not left.test.of(statistics).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(PlacedCurve(place, names[k][1:]),))
-    location, space = beside.where, beside.space
+    location, space = base_curve.where, base_curve.space
     equations = {_equation_of_effect(space, effect) for effect in best.effects}
     # Linear rows of logs have no fit of a curve.
     if not space.bare.observe.over_time and equation_of_place(location.place) in equations:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
-        adequate = not left.test.exceeds_margin("chi2", beside.fitted.chi2[1])
-        if adequate and not beside.diagnosis.test.rejected_with_margin:
+        adequate = not left.test.exceeds_margin("chi2", base_curve.fitted.chi2[1])
+        if adequate and not base_curve.diagnosis.test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(PlacedCurve(location.place, (location.variable,)),))
     return NameSupport(True)
 
 
-def _strongest_curves(seen: Diagnosis, bases: Bases, equation: str) -> list[int]:
+def _strongest_curves(diagnosis: Diagnosis, bases: Bases, equation: str) -> list[int]:
     """Families of curves outside an equation, the most significant first, until the residuals are noise or `CURVES`
     are added.
     """
-    places, linear = [n[0] for n in bases_room.family_names(bases)], seen.linear
-    barred = np.array([equation_of_place(p) == equation for p in places])
+    places, linear = [n[0] for n in bases_room.family_names(bases)], diagnosis.linear
+    excluded = np.array([equation_of_place(p) == equation for p in places])
     chosen_curves, columns = list[int](), np.zeros((linear.readings, 0))
-    deviate, test = np.array(seen.scores.curve), seen.test
+    deviate, test = np.array(diagnosis.scores.curve), diagnosis.test
     while test.rejected_with_margin and len(chosen_curves) < CURVES:
-        chosen_curves.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
+        chosen_curves.append(int(np.argmax(np.where(excluded, -np.inf, deviate))))
         columns = np.concatenate([columns, family_columns(linear, bases, chosen_curves[-1])], 1)
         statistics, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen_curves])
         test = test.of(statistics)
@@ -234,7 +234,7 @@ def _strongest_curves(seen: Diagnosis, bases: Bases, equation: str) -> list[int]
 
 
 def judge_each_name(
-    beside: BaseCurve,
+    base_curve: BaseCurve,
     best: Candidate,
     searched: SearchResult,
     after: Diagnosis,
@@ -257,14 +257,14 @@ def judge_each_name(
         blocks: as in `judge_names`.
         better: candidates that are the better explanation but not of a plausible size.
     """
-    space, bases, settings = beside.space, beside.bases, beside.settings
+    space, bases, settings = base_curve.space, base_curve.bases, base_curve.settings
     names, largest, tests = bases_room.family_names(bases), searched.best or best, []
     over_time = space.bare.observe.over_time
-    most = searched.diagnosis or after
-    lacks = _deficient_equations(space, most, bases)
-    fewer = dict(zip(largest.effects, refit_without_each(space, largest, searched.ladder), strict=True))
+    diagnosis_of_largest = searched.diagnosis or after
+    deficient = _deficient_equations(space, diagnosis_of_largest, bases)
+    without_each = dict(zip(largest.effects, refit_without_each(space, largest, searched.ladder), strict=True))
     without_effect = refit_without_each(space, best, searched.ladder)
-    fits = {c.active: c for c in (*without_effect, *(c for e, c in fewer.items() if e in best.effects))}
+    fits = {c.active: c for c in (*without_effect, *(c for e, c in without_each.items() if e in best.effects))}
     linearizations = {active: diagnose_candidate(space, c, bases, after).linear for active, c in fits.items()}
     for effect, without in zip(best.effects, without_effect, strict=True):
         equation, linear = _equation_of_effect(space, effect), linearizations[without.active]
@@ -280,10 +280,10 @@ def judge_each_name(
             row, changed, root_changed = changed_run(space, linear, bases, fit)
         else:
             row, root_without = _most_influential_row(space, fit, columns)
-        full_fit, other_fit = (largest, fewer[effect]) if effect in fewer else (best, without)
-        evidence = evidence_over_curves(beside, full_fit, other_fit, (effect,), linearizations[other_fit.active])
+        full_fit, other_fit = (largest, without_each[effect]) if effect in without_each else (best, without)
+        evidence = evidence_over_curves(base_curve, full_fit, other_fit, (effect,), linearizations[other_fit.active])
         families = (space.library[effect].family(),)
-        beside_all = most.linear if effect in fewer else after.linear
+        linear_of_largest = diagnosis_of_largest.linear if effect in without_each else after.linear
         tests.append(
             NameTest(
                 effect,
@@ -297,8 +297,8 @@ def judge_each_name(
                     space, families, judged, space.library.columns(effect, tangent), tangent, blocks, settings
                 ),
                 next((c.effects for c in better if effect not in c.effects), ()),
-                equation in lacks,
-                *_largest_variation(space, full_fit, effect, beside_all, settings.shares["single"]),
+                equation in deficient,
+                *_largest_variation(space, full_fit, effect, linear_of_largest, settings.shares["single"]),
                 offset=_relative_zero_error(space, best, effect, settings),
                 changed=changed,
                 root_changed=root_changed,
@@ -320,15 +320,15 @@ def _relative_zero_error(space: CandidateSpace, best: Candidate, effect: str, se
     return amplitude / max(float(np.sqrt(np.nanmean(measured**2))), 1e-300)
 
 
-def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
+def _deficient_equations(space: CandidateSpace, diagnosis: Diagnosis, bases: Bases) -> set[str]:
     """Equations with a significant discrepancy: those of the most significant curve and of the strongest effect."""
-    if not seen.test.rejected_with_margin:
+    if not diagnosis.test.rejected_with_margin:
         return set()
-    lacks = {equation_of_place(locate_discrepancy(seen, bases, space.included).place)}
-    if seen.test.exceeds_margin("single"):
-        strongest = space.library.of[int(np.argmax(np.abs(seen.scores.single)))]
-        lacks.add(_equation_of_effect(space, space.library.names[strongest]))
-    return lacks
+    deficient = {equation_of_place(locate_discrepancy(diagnosis, bases, space.included).place)}
+    if diagnosis.test.exceeds_margin("single"):
+        strongest = space.library.of[int(np.argmax(np.abs(diagnosis.scores.single)))]
+        deficient.add(_equation_of_effect(space, space.library.names[strongest]))
+    return deficient
 
 
 def _largest_variation(
@@ -336,36 +336,37 @@ def _largest_variation(
 ) -> tuple[float, str, float, float]:
     """Largest change of an effect's amplitude over a variable, as a line or a parabola.
 
-    Returns the root of its score after a refit [σ], the variable, the critical value and the relative change of the
-    amplitude at an end of the variable [-]. The critical value holds for all these tests (Bonferroni 1936).
+    Returns the root of its score after a refit [σ], the variable, the critical value [σ], and the relative change
+    of the amplitude at an end of the variable's range [-]. The critical value holds for all these tests
+    (Bonferroni 1936).
 
     To first order, the residual of a law of another form is the name's own term with an amplitude that varies. So
-    a few columns can test what a whole family of curves, with many more, cannot. For settled runs, where each row
-    depends only on its own term, 0 for histories.
+    a few columns can test what a whole family of curves, with many more, cannot. Only for
+    settled runs, where each row depends only on the term in this row. In histories the root is 0.
 
     Args:
         linear: the fit of the candidate, linearised.
         share: family-wise error of the critical value.
     """
-    most = 0.0, "", math.inf
+    largest = 0.0, "", math.inf
     if space.bare.observe.over_time:
-        return *most[:2], math.inf, math.inf
+        return *largest[:2], math.inf, math.inf
     fit, slot = Projection.of(linear), space.free + best.active.index(effect)
     of_row = fit.jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _variable_varies(linear, v, space.included)]
     for variable in variables:
         values = linear.curve_variable(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
-        changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
-        for root, norm2, score in zip(fit.roots(changed), *fit.norms(changed), strict=True):
+        columns = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
+        for root, norm2, score in zip(fit.roots(columns), *fit.norms(columns), strict=True):
             spread = abs(score / max(norm2, 1e-300) / best.z[slot]) if best.z[slot] else math.inf
-            most = max(most, (float(root), variable, float(spread)))
+            largest = max(largest, (float(root), variable, float(spread)))
     chance = NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
-    return *most[:2], chance, most[2]
+    return *largest[:2], chance, largest[2]
 
 
 def evidence_over_curves(
-    beside: BaseCurve, best: Candidate, without: Candidate, effects: Names, linear: Linearization
+    base_curve: BaseCurve, best: Candidate, without: Candidate, effects: Names, linear: Linearization
 ) -> float:
     """Twice the log Bayes factor of effects of one equation over the best smooth curve in it [σ²].
 
@@ -376,11 +377,11 @@ def evidence_over_curves(
         without: the same candidate without them.
         linear: linearization at `without`.
     """
-    space = beside.space
+    space = base_curve.space
     equation = _equation_of_effect(space, effects[0])
-    offered = sum(_equation_of_effect(space, name) == equation for name in space.library.names)
-    cost = sum(_cost_of_effect(space, best, name) + 2 * math.log(offered) for name in effects)
-    same_equation = [evidence for evidence, _ in _curve_evidence(space, linear, beside.bases, set(), equation)]
+    rivals = sum(_equation_of_effect(space, name) == equation for name in space.library.names)
+    cost = sum(_cost_of_effect(space, best, name) + 2 * math.log(rivals) for name in effects)
+    same_equation = [evidence for evidence, _ in _curve_evidence(space, linear, base_curve.bases, set(), equation)]
     by_curve = max(same_equation, default=-math.inf) - 2 * math.log(max(len(same_equation), 1))
     return 2 * (without.cost - best.cost) - cost - by_curve
 
@@ -392,20 +393,22 @@ def _with_curves(linear: Linearization, bases: Bases, curves: Sequence[int]) -> 
 
 
 def recurrence_of_families(
-    beside: BaseCurve, best: Candidate, families: Sequence[str], blocks: Sequence[np.ndarray]
+    base_curve: BaseCurve, best: Candidate, families: Sequence[str], blocks: Sequence[np.ndarray]
 ) -> float:
     """Share of the informative blocks for which, without the block, an effect of these families still explains most.
 
     A block is informative if half of the information on the candidate's first effect remains without it. 1 if there
     is none.
     """
-    space, effect, linear = beside.space, best.effects[0], beside.left.linear
+    space, effect, linear = base_curve.space, best.effects[0], base_curve.left.linear
     fit = Projection.of(linear)
-    if fit.roots(space.library.columns(effect, linear)).max() ** 2 < PROMISED * 2 * (beside.base.cost - best.cost):
-        linear = diagnose_candidate(space, best, beside.bases, beside.left).linear
+    if fit.roots(space.library.columns(effect, linear)).max() ** 2 < PROMISED * 2 * (
+        base_curve.base.cost - best.cost
+    ):
+        linear = diagnose_candidate(space, best, base_curve.bases, base_curve.left).linear
         fit = remove_effect(space, best, effect, Projection.of(linear))
     columns = space.library.columns(effect, linear)
-    return _recurrence(space, families, fit, columns, linear, blocks, beside.settings)
+    return _recurrence(space, families, fit, columns, linear, blocks, base_curve.settings)
 
 
 def _recurrence(
@@ -419,7 +422,7 @@ def _recurrence(
 ) -> float:
     """Share of the informative blocks for which, without the block, an effect of these families still explains most.
 
-    The criterion is that of `classes`. A block is informative if half of the information on the effect remains
+    The criterion is the same as in `classes`. A block is informative if half of the information on the effect remains
     without it. 1 if there is none.
 
     If an effect explains much, the fit without it may be so far off that its linearization predicts nothing reliable.
@@ -429,31 +432,31 @@ def _recurrence(
         columns: sensitivities to the effect.
         linear: linearization with the sensitivities to all effects of the library.
     """
-    library, chosen_effects, signatures = space.library, [], np.asarray(linear.signatures)
-    akin = np.array([library[name].family() in families for name in library.names])[library.of]
-    best_score = fit.norms(columns)[0].max()
-    for out in blocks:
-        kept_rows = kept_readings(space, out, len(signatures))
+    library, recurs, signatures = space.library, [], np.asarray(linear.signatures)
+    same_family = np.array([library[name].family() in families for name in library.names])[library.of]
+    information = fit.norms(columns)[0].max()
+    for left_out in blocks:
+        kept_rows = kept_readings(space, left_out, len(signatures))
         without = fit.only(kept_rows)
-        if without.norms(columns[kept_rows])[0].max() < 0.5 * best_score:
+        if without.norms(columns[kept_rows])[0].max() < 0.5 * information:
             continue
         roots = without.roots(signatures[kept_rows])
         most = np.max(roots) ** 2
-        chosen_effects.append(np.max(roots[akin]) ** 2 >= most - settings.tolerance(most))
-    return float(np.mean(chosen_effects)) if chosen_effects else 1.0
+        recurs.append(np.max(roots[same_family]) ** 2 >= most - settings.tolerance(most))
+    return float(np.mean(recurs)) if recurs else 1.0
 
 
 def _most_influential_row(space: CandidateSpace, fit: Projection, columns: np.ndarray) -> tuple[int | None, float]:
     """Number of the row whose omission reduces the largest root most, and the root without it. None for fewer than
     three rows.
     """
-    least: tuple[int | None, float] = None, math.inf
+    lowest: tuple[int | None, float] = None, math.inf
     rows = np.flatnonzero(space.included)
     for row in rows if len(rows) > 2 else ():
         kept_rows = kept_readings(space, np.arange(len(space.included)) == row, len(columns))
         root = float(fit.only(kept_rows).roots(columns[kept_rows]).max())
-        least = (int(row) + 1, root) if root < least[1] else least
-    return least
+        lowest = (int(row) + 1, root) if root < lowest[1] else lowest
+    return lowest
 
 
 def changed_run(
@@ -474,16 +477,16 @@ def changed_run(
     best: tuple[int | None, str, float] = None, "", 0.0
     runs = [(k, rows) for k, rows in enumerate(linear.runs()) if space.included[rows].any()]
     for k, rows in runs if len(runs) > 1 else ():
-        out = np.zeros(len(space.included), bool)
-        out[rows] = True
-        inside = np.flatnonzero(~kept_readings(space, out, readings))
-        roots = fit.roots(constants[inside], inside)
+        left_out = np.zeros(len(space.included), bool)
+        left_out[rows] = True
+        readings_of_run = np.flatnonzero(~kept_readings(space, left_out, readings))
+        roots = fit.roots(constants[readings_of_run], readings_of_run)
         if roots.max() > best[2]:
             best = k + 1, names[int(np.argmax(roots))], float(roots.max())
     return best
 
 
-def kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
+def kept_readings(space: CandidateSpace, left_out: np.ndarray, readings: int) -> np.ndarray:
     """True for readings that remain after some rows are left out, including padding, shape (readings,)."""
-    rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
+    rows = np.concatenate([left_out, np.zeros(len(space.included) - len(left_out), bool)])
     return np.repeat(~rows, readings // len(rows))

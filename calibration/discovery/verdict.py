@@ -23,7 +23,7 @@ from calibration.discovery.loop_notes import VerdictSummary
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutScore, Predicted
 from calibration.discovery.settings import WITHOUT_NAME
-from calibration.inference import checks as unused_room
+from calibration.inference import checks
 from calibration.inference.fit_notes import Remark
 from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
 from calibration.inference.linearization import Linearization
@@ -135,8 +135,8 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
     support = None if traced.standing is None else traced.standing.with_row_numbers(numbers)
     best = None if traced.searched is None else traced.searched.best
     base = traced.screened.base.candidate
-    aside, counting = len(traced.screened.outliers), int(space.included.sum())
-    many = aside > MANY * (aside + counting)
+    outlier_count, included_count = len(traced.screened.outliers), int(space.included.sum())
+    is_many = outlier_count > MANY * (outlier_count + included_count)
     classes = () if alike is None else zip(alike.members, alike.stated, alike.families, strict=True)
     missing = (
         loop_notes.MissingEffect(
@@ -155,8 +155,8 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
         missing=tuple(missing),
         nearest=best.effects if traced.verdict in WITHOUT_NAME and best is not None else (),
         support=support,
-        aside=aside if many else 0,
-        of=aside + counting,
+        aside=outlier_count if is_many else 0,
+        of=outlier_count + included_count,
         noise=traced.sds.remarks if traced.sds.factors and traced.verdict == "none" else (),
         cluster=traced.screened.cluster,
         mechanism=traced.mechanism,
@@ -184,19 +184,19 @@ def missed_channels(
         return ()
     rows = len(runs)
     counts = space.weight[:rows] > 0
-    off = np.where(counts, np.asarray(refit.by_row())[:rows], 0.0)
-    sd, size2 = np.where(counts, noise.sd, 0.0), np.sum(np.where(counts, runs.measured(), 0.0) ** 2, 0)
-    share = np.sqrt(np.sum((off * sd) ** 2, 0)) / np.maximum(np.sqrt(size2), 1e-300)
-    sigma = np.sqrt(np.sum(off**2, 0) / np.maximum(counts.sum(0), 1))
+    whitened = np.where(counts, np.asarray(refit.by_row())[:rows], 0.0)
+    sd, squares = np.where(counts, noise.sd, 0.0), np.sum(np.where(counts, runs.measured(), 0.0) ** 2, 0)
+    error_share = np.sqrt(np.sum((whitened * sd) ** 2, 0)) / np.maximum(np.sqrt(squares), 1e-300)
+    sigma = np.sqrt(np.sum(whitened**2, 0) / np.maximum(counts.sum(0), 1))
     has_stated_sd = np.array([source not in UNSTATED for source in noise.source])
-    large = (share > UNDESCRIBED) & ~(has_stated_sd & (sigma <= EXPLAINED))
+    large = (error_share > UNDESCRIBED) & ~(has_stated_sd & (sigma <= EXPLAINED))
     with np.errstate(invalid="ignore"):
-        noisy = np.sqrt(np.sum(sd**2, 0) / size2)
-    noisy = np.where(has_stated_sd, 0.0, noisy)
+        noise_share = np.sqrt(np.sum(sd**2, 0) / squares)
+    noise_share = np.where(has_stated_sd, 0.0, noise_share)
     return tuple(
-        loop_notes.MissedChannel(c.name, float(share[k]), float(noisy[k]))
+        loop_notes.MissedChannel(c.name, float(error_share[k]), float(noise_share[k]))
         for k, c in enumerate(runs.channels)
-        if large[k] or noisy[k] > UNDESCRIBED
+        if large[k] or noise_share[k] > UNDESCRIBED
     )
 
 
@@ -205,20 +205,22 @@ def remaining_errors(
     runs: Runs,
     missed: Sequence[loop_notes.MissedChannel],
     refit: HeldOutScore,
-    found: HeldOutScore,
+    with_effects: HeldOutScore,
 ) -> tuple[loop_notes.MissedChannel, ...]:
     """Hold-out errors of the missed channels after effects were added.
 
-    None if the effects do not describe the runs either. This is so if more than `UNDESCRIBED` of a channel's rms
-    remains, less than `REMOVED` of the refit's error has gone, or the noise itself is estimated to be that large.
+    Empty if the effects do not describe the runs either. Then more than `UNDESCRIBED` of a channel's rms remains,
+    less than `REMOVED` of the refit's error is gone, or the estimated noise alone exceeds `UNDESCRIBED`.
 
     Args:
         missed: channels from `missed_channels`.
-        refit, found: hold-out predictions without and with the effects.
+        refit, with_effects: hold-out predictions without and with the effects.
     """
     measured, counts = runs.measured(), space.weight[: len(runs)] > 0
-    off = [[np.where(counts, x - measured, np.nan) for x in score.reading.values()] for score in (refit, found)]
-    errors: np.ndarray = np.array(off).reshape(2, -1, measured.shape[1])
+    deviations = [
+        [np.where(counts, x - measured, np.nan) for x in score.reading.values()] for score in (refit, with_effects)
+    ]
+    errors: np.ndarray = np.array(deviations).reshape(2, -1, measured.shape[1])
     errors = np.where(np.isfinite(errors).all(0), errors, np.nan)  # of readings that both predict
     with np.errstate(invalid="ignore"):
         size = np.nansum(np.where(counts, measured, np.nan) ** 2, 0) / counts.sum(0)
@@ -234,5 +236,5 @@ def remaining_errors(
 
 def unused_inputs(runs: Runs) -> Names:
     """Numeric columns that vary but have no role, and an output torque that may be imposed by a brake."""
-    torques = (f"{note.theirs} as a condition" for note in unused_room.unexplained_torque_notes(runs))
-    return (*unused_room.unused_columns(runs), *torques)
+    torques = (f"{note.theirs} as a condition" for note in checks.unexplained_torque_notes(runs))
+    return (*checks.unused_columns(runs), *torques)
