@@ -34,7 +34,7 @@ SMALL = 0.1
 
 
 def join_torques(values: Sequence[float]) -> str:
-    """«0, 0.2 and 0.4 N·m». In mN·m where all are below `SMALL`."""
+    """«0, 0.2 and 0.4 N·m». In mN·m if all are below `SMALL`."""
     factor, unit = (1e3, "mN·m") if max(map(abs, values)) < SMALL else (1.0, "N·m")
     return join_amounts([menu.round_significant(factor * v, 3) for v in values], unit)
 
@@ -43,8 +43,8 @@ def join_slopes(angles: Sequence[float]) -> str:
     """«on the level and up 10 and 20 deg»."""
     words = ["on the level"] if any(s == 0 for s in angles) else []
     for word, sign in (("up", 1), ("down", -1)):
-        some = [abs(s) for s in angles if s * sign > 0]
-        words += [f"{word} {join_amounts(some, 'deg')}"] if some else []
+        angles_of_sign = [abs(s) for s in angles if s * sign > 0]
+        words += [f"{word} {join_amounts(angles_of_sign, 'deg')}"] if angles_of_sign else []
     return join_words(words)
 
 
@@ -58,7 +58,7 @@ ACTS = {
     "strobe": "Set the motor to {} by stroboscope and read the tachometer",
     "timing": "Drive at {} between two light gates, and compare both speeds",
 }
-#: Units of what they set.
+#: Unit of the setting of each act.
 UNITS = {"shunt": "A", "strobe": "rad/s", "timing": "m/s", "zero current": ""}
 #: Instructions for each kind of runs.
 DOING = {
@@ -88,8 +88,8 @@ def _act(act: menu.CalibrationAct) -> str:
         configuration_words = {1: "", 2: "in both configurations, "}.get(
             len(configurations), "in each configuration, "
         )
-        laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
-        return f"Weigh the robot {configuration_words}{laden}to within 20 g, and compare with the robot file"
+        loads = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
+        return f"Weigh the robot {configuration_words}{loads}to within 20 g, and compare with the robot file"
     (kind,) = act.kinds
     if act.channel:
         return ACTS[kind].format(channels.find_channel(act.channel).label)
@@ -97,8 +97,8 @@ def _act(act: menu.CalibrationAct) -> str:
 
 
 def _run(run: menu.ProposedRuns) -> str:
-    level = (run.reach.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
-    slope_words = "" if run.setup in menu.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
+    is_level = (run.reach.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
+    slope_words = "" if run.setup in menu.WEIGHTLESS or is_level else f" {join_slopes(run.slope)}"
     read = join_words([channels.find_channel(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
     unit = {"voltage": "V", "motor_current": "A per motor"}.get(run.reach.imposed)
@@ -121,7 +121,7 @@ def _doing(run: menu.ProposedRuns) -> str:
 
 
 def heated_winding(temperature: float, allowed: float | None) -> str:
-    """Phrase for how hot a winding gets that stays energised.
+    """Phrase on the temperature of a winding that stays energised.
 
     Args:
         temperature: steady-state temperature, infinite if there is none [°C].
@@ -137,7 +137,7 @@ def _temperature_limit(temperature: float) -> str:
     return f" (limit {temperature:.0f} °C)" if temperature < menu.UNLIMITED else ""
 
 
-# --- what is proposed -----------------------------------------------------------------------------------
+# --- proposals ------------------------------------------------------------------------------------------
 
 
 #: Imposed quantity → its name, and its unit where people set it.
@@ -146,84 +146,89 @@ IMPOSED = {
 }  # fmt: skip
 
 
-def instruction_for_further_runs(what: SimpleNamespace) -> str:
-    """More runs along the variable of a discrepancy, from the values of `denser_runs_instruction`."""
-    (name, _), (_, angle, mass) = IMPOSED[what.within.imposed], what.steps
-    if what.variable in bases.ORDERS:
-        three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
+def instruction_for_further_runs(series: SimpleNamespace) -> str:
+    """Instruction for more runs along the variable of a discrepancy, from the values of `denser_runs_instruction`."""
+    (name, _), (_, slope_step, payload_step) = IMPOSED[series.within.imposed], series.steps
+    if series.variable in bases.ORDERS:
+        voltages = [
+            f"{menu.round_significant(v):g}" for v in (series.low, 0.5 * (series.low + series.high), series.high)
+        ]
         return (
             "Mark the driving shaft, start every run at the mark, and record steady travel at "
-            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. The part that turns at "
-            f"{what.variable} causes it"
+            f"{', '.join(voltages[:2])} and {voltages[2]} V with at least 20 samples per wave. The part that turns "
+            f"at {series.variable} causes it"
         )
-    happens = bases.window_from_name(what.variable)
-    if happens is not None:
-        return _repeat_instruction(happens)
-    if what.variable == "slope":
+    window = bases.window_from_name(series.variable)
+    if window is not None:
+        return _repeat_instruction(window)
+    if series.variable == "slope":
         return (
-            f"Repeat at one {name} and payload with slopes from 0 to {what.slope:g} deg in steps of {angle:g} deg, "
-            "and downhill"
+            f"Repeat at one {name} and payload with slopes from 0 to {series.slope:g} deg in steps of {slope_step:g} "
+            "deg, and downhill"
         )
-    if what.variable == "payload":
-        return f"Repeat at one {name} and slope with payloads from 0 to {what.payload:g} kg in steps of {mass:g} kg"
-    if what.variable == "time":
-        warm = f"{what.low:g} V or less" if name == "voltage" else f"one {name}"
+    if series.variable == "payload":
         return (
-            f"Record ten minutes at {warm} from a cold start, and again while warm. Watch the winding's "
-            f"temperature{_temperature_limit(what.within.hot)}"
+            f"Repeat at one {name} and slope with payloads from 0 to {series.payload:g} kg in steps of "
+            f"{payload_step:g} kg"
         )
-    if what.variable == "order":
+    if series.variable == "time":
+        cool = f"{series.low:g} V or less" if name == "voltage" else f"one {name}"
+        return (
+            f"Record ten minutes at {cool} from a cold start, and again while warm. Watch the winding's "
+            f"temperature{_temperature_limit(series.within.hot)}"
+        )
+    if series.variable == "order":
         return "Repeat the table in reverse order, and repeat one reference condition after every fifth run"
-    return _advice_on_drive(what) or (
-        f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its range"
+    return _advice_on_drive(series) or (
+        f"Repeat, and vary the {bases.variable_in_words(series.variable)} in small, equal steps over its range"
     )
 
 
-def _advice_on_drive(what: SimpleNamespace) -> str:
-    """More levels of what drives the motors, or of their load, empty for other variables."""
-    variable, within, (name, unit) = what.variable, what.within, IMPOSED[what.within.imposed]
-    volts, top = unit == "V", menu.round_significant(what.top)
-    if not volts:
-        usual = {"rpm": within.motor_speed / RPM, "A": within.current}[unit]
-        most = max((x / RPM if unit == "rpm" else x for x in within.levels), default=usual)
-        levels = f"the {name}{_up_to(most, what.runs, unit)}"
-    elif what.by_duty:
-        levels = f"the duty{_up_to(max(within.duties), what.runs, first='crawl')} at {top:g} V"
+def _advice_on_drive(series: SimpleNamespace) -> str:
+    """Instruction for more levels of the imposed quantity or of the load. Empty for other variables."""
+    variable, within, (name, unit) = series.variable, series.within, IMPOSED[series.within.imposed]
+    imposes_voltage, top = unit == "V", menu.round_significant(series.top)
+    if not imposes_voltage:
+        largest = {"rpm": within.motor_speed / RPM, "A": within.current}[unit]
+        limit = max((x / RPM if unit == "rpm" else x for x in within.levels), default=largest)
+        levels = f"the {name}{_up_to(limit, series.runs, unit)}"
+    elif series.by_duty:
+        levels = f"the duty{_up_to(max(within.duties), series.runs, first='crawl')} at {top:g} V"
     elif within.has_ground:
-        levels = f"the supply voltage in steps of {what.steps[0]:g} V from a crawl to {what.high:g} V"
+        levels = f"the supply voltage in steps of {series.steps[0]:g} V from a crawl to {series.high:g} V"
     else:
-        levels = f"the supply voltage{_up_to(what.top, what.runs, 'V', 'crawl')}"
-    fixed = f"{what.high:g} V" if volts else f"one {name}"
-    if variable == "voltage" and volts:
+        levels = f"the supply voltage{_up_to(series.top, series.runs, 'V', 'crawl')}"
+    fixed = f"{series.high:g} V" if imposes_voltage else f"one {name}"
+    if variable == "voltage" and imposes_voltage:
         return f"Repeat {'at one slope and payload ' * within.has_ground}with {levels}"
-    if within.has_ground and volts and variable == "speed":
+    if within.has_ground and imposes_voltage and variable == "speed":
         return f"Repeat on the level, unladen, with the speed in equal steps up to {within.speed:.2g} m/s at {fixed}"
-    if within.has_ground and volts and variable == "current":
-        load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
-        load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
-        loaded, most = " and ".join(load) or "a brake or a drawbar pull", within.current * within.motors
-        return f"Repeat at {fixed} with {loaded}, raised in small steps, up to {most:.2g} A"
+    if within.has_ground and imposes_voltage and variable == "current":
+        load = [f"a payload up to {series.payload:g} kg"] * bool(series.payload > 0)
+        load += [f"a slope up to {series.slope:g} deg"] * bool(series.slope > 0)
+        loaded, limit = " and ".join(load) or "a brake or a drawbar pull", within.current * within.motors
+        return f"Repeat at {fixed} with {loaded}, raised in small steps, up to {limit:.2g} A"
     if not within.has_ground and variable == "current" and any(within.torques):
-        most = max(within.torques)
-        factor, torque_unit = (1e3, "mN·m") if most < SMALL else (1.0, "N·m")
-        brake = f"the brake's torque{_up_to(factor * most, what.runs, torque_unit)}"
-        return f"Repeat at {f'{top:g} V' if volts else fixed} with {brake}"
+        limit = max(within.torques)
+        factor, torque_unit = (1e3, "mN·m") if limit < SMALL else (1.0, "N·m")
+        brake = f"the brake's torque{_up_to(factor * limit, series.runs, torque_unit)}"
+        return f"Repeat at {f'{top:g} V' if imposes_voltage else fixed} with {brake}"
     if variable in ("speed_motor", "speed", *["current"] * (not within.has_ground)):
         return f"Repeat {'on the level, unladen, ' * within.has_ground}with {levels}"
     return ""
 
 
-def _repeat_instruction(happens: bases.Window) -> str:
-    """The same runs, where something happens for a while or at one level."""
-    if happens.axis == "order":
+def _repeat_instruction(window: bases.Window) -> str:
+    """Instruction to repeat the runs of a temporary change, or of one level."""
+    if window.axis == "order":
         return (
-            f"Repeat runs {happens.low:.0f} to {happens.high:.0f} in a different order, mixed with as many other "
+            f"Repeat runs {window.low:.0f} to {window.high:.0f} in a different order, mixed with as many other "
             "runs. If the error returns, their conditions cause it"
         )
-    if happens.axis != "time":
-        return f"Repeat the runs at {happens.words} on another day, with some slightly below and above"
+    if window.axis != "time":
+        return f"Repeat the runs at {window.words} on another day, with some slightly below and above"
     return (
-        f"Repeat two runs, finely sampled from {happens.low:.3g} to {happens.high:.3g} s. In one of them, change no "
+        f"Repeat two runs, finely sampled from {window.low:.3g} to {window.high:.3g} s. In one of them, change no "
         "input during that time"
     )
 
@@ -235,14 +240,6 @@ def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
     return (
         f" from a {first} to {last} in steps of {step_words}" if first else f" up to {last} in steps of {step_words}"
     )
-
-
-#: Imposed quantity → its name, and its unit where people set it.
-IMPOSED = {
-    "voltage": ("voltage", "V"),
-    "motor_speed": ("motor speed", "rpm"),
-    "motor_current": ("motor current", "A"),
-}
 
 
 #: Code of an instruction or of what to watch → a sentence with its values, or a function that makes one.
@@ -331,9 +328,9 @@ def effect_tests(effect: type[Effect]) -> Iterator[str]:
         for name in CHECKED_BY.get(effect.channel, ()):
             yield ACTS[name].format("several values")
         if effect.channel not in CHECKED_BY:
-            channel_shown = find_channel(effect.channel)
-            yield from [ACTS["zero reading"].format(channel_shown.label)] * channel_shown.misses_zero
-            yield COMPARE.format(channel_shown.label)
+            channel = find_channel(effect.channel)
+            yield from [ACTS["zero reading"].format(channel.label)] * channel.misses_zero
+            yield COMPARE.format(channel.label)
         return
     for name in ISOLATED_BY.get(effect.balance, ()):
         if name == "weigh":
@@ -347,5 +344,5 @@ def effect_tests(effect: type[Effect]) -> Iterator[str]:
                 shafts="the motor shafts",
             )
             yield f"{text[0].upper()}{text[1:].rstrip(',')}, at several voltages"
-    variation = VARY.get(effect.driver, f"the {effect.driver}")  # one's own may go with anything
+    variation = VARY.get(effect.driver, f"the {effect.driver}")  # effects of the user may have any driver
     yield f"Vary {variation}" + (", from rest, over time" if effect.transient or effect.settles_to else "")

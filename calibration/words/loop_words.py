@@ -32,67 +32,67 @@ if TYPE_CHECKING:
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
-def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
-    """A verdict in a sentence or a few: the claim with its evidence, then what qualifies it."""
-    where, evidence = said.where, f"family-wise p {p_value(said.p)}"
-    if said.missed:
-        evidence += f", but it still misses {', '.join(map(_missed, said.missed))} on unseen runs"
-    if said.verdict == "none":
-        text = f"Nothing is missing: the residuals are consistent with noise (family-wise p = {said.p:.2g})."
-    elif said.verdict == "undescribed":
-        text = _undescribed(said)
-    elif said.verdict in WITHOUT_NAME and where is not None:
-        claim = _mechanism_claim if said.verdict == "mechanism" else _place_claim
-        text = f"{claim(said, where, evidence)}{_not_established(said)}"
+def verdict_sentences(summary: loop_notes.VerdictSummary) -> str:
+    """A verdict in a few sentences: the claim with its evidence, then its limits."""
+    where, evidence = summary.where, f"family-wise p {p_value(summary.p)}"
+    if summary.missed:
+        evidence += f", but it still misses {', '.join(map(_missed, summary.missed))} on unseen runs"
+    if summary.verdict == "none":
+        text = f"Nothing is missing: the residuals are consistent with noise (family-wise p = {summary.p:.2g})."
+    elif summary.verdict == "undescribed":
+        text = _undescribed(summary)
+    elif summary.verdict in WITHOUT_NAME and where is not None:
+        claim = _mechanism_claim if summary.verdict == "mechanism" else _place_claim
+        text = f"{claim(summary, where, evidence)}{_not_established(summary)}"
     else:
-        names = [_effect_and_rivals(one) for one in said.missing if one.established]
-        text = f"Missing: {' and '.join(names)} ({evidence}).{_tentative(said)}"
+        names = [_effect_and_rivals(effect) for effect in summary.missing if effect.established]
+        text = f"Missing: {' and '.join(names)} ({evidence}).{_tentative(summary)}"
         text += "" if where is None else f" The {bases.place_in_words(where.place)} still has an error."
-    if said.aside:
-        share = 100 * said.aside / said.of
-        text = f"{said.aside} of {said.of} rows ({share:.0f} %) are set aside as outliers. {text}"
-    if said.noise:
-        text = f"{text} But {'. '.join(map(describe, said.noise))}"
-    if said.cluster is not None:
-        text = f"{text} {cluster_sentence(said.cluster).capitalize()}, so these rows are kept."
+    if summary.aside:
+        share = 100 * summary.aside / summary.of
+        text = f"{summary.aside} of {summary.of} rows ({share:.0f} %) are set aside as outliers. {text}"
+    if summary.noise:
+        text = f"{text} But {'. '.join(map(describe, summary.noise))}"
+    if summary.cluster is not None:
+        text = f"{text} {cluster_sentence(summary.cluster).capitalize()}, so these rows are kept."
     return text
 
 
-def _mechanism_claim(said: loop_notes.VerdictSummary, where: DiscrepancyLocation, evidence: str) -> str:
+def _mechanism_claim(summary: loop_notes.VerdictSummary, where: DiscrepancyLocation, evidence: str) -> str:
     """A mechanism with its evidence: share of the misfit, gain on held-out runs, and repeatability."""
-    found = said.mechanism
-    assert found is not None
-    names = " or ".join(map(with_article, found.families))
-    if where.family in found.families and where.window is not None:
-        names += f", {_shown(where)}"
-    errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
+    mechanism = summary.mechanism
+    assert mechanism is not None
+    names = " or ".join(map(with_article, mechanism.families))
+    if where.family in mechanism.families and where.window is not None:
+        names += f", {_variable_phrase(where)}"
+    errors = f", {mechanism.gain / mechanism.se:.1f} standard errors" if 0 < mechanism.se < math.inf else ""
     return (
-        f"Missing: {names}, established as a mechanism. It explains {100 * found.share:.0f} % of the misfit "
-        f"beyond noise, raises the log likelihood of held-out runs by {found.gain:.2g} per affected reading{errors}, "
-        f"and is found again in {100 * found.again:.0f} % of the fits without one block ({evidence}). No law of the "
-        "library is established."
+        f"Missing: {names}, established as a mechanism. It explains {100 * mechanism.share:.0f} % of the misfit "
+        f"beyond noise, raises the log likelihood of held-out runs by {mechanism.gain:.2g} per affected "
+        f"reading{errors}, and is found again in {100 * mechanism.again:.0f} % of the fits without one block "
+        f"({evidence}). No law of the library is established."
     )
 
 
-def _place_claim(said: loop_notes.VerdictSummary, where: DiscrepancyLocation, evidence: str) -> str:
-    """A place with the variable that shows it, and reasons why there is no more."""
+def _place_claim(summary: loop_notes.VerdictSummary, where: DiscrepancyLocation, evidence: str) -> str:
+    """A place with the variable that shows it, and reasons why nothing more is established."""
     others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which these data cannot distinguish)" if others else ""
     family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
-    no_effect = "is established" if said.missing else "explains it"
-    no_more = "" if said.mechanism is None else f" No mechanism is established: {no_mechanism(said.mechanism)}."
+    no_effect = "is established" if summary.missing else "explains it"
+    no_more = "" if summary.mechanism is None else f" No mechanism is established: {no_mechanism(summary.mechanism)}."
     return (
-        f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}. No "
-        f"effect of the library {no_effect} ({evidence}).{no_more}"
+        f"Something is missing in the {bases.place_in_words(where.place)}{also}, "
+        f"{_variable_phrase(where)}{family_words}. No effect of the library {no_effect} ({evidence}).{no_more}"
     )
 
 
-def _not_established(said: loop_notes.VerdictSummary) -> str:
-    """Effects that are in the model without an established name, or else the nearest candidates."""
-    if said.missing or not said.nearest:
-        return _tentative(said)
-    candidates, them = ("candidate is", "it") if len(said.nearest) == 1 else ("candidates are", "them")
-    return f" The nearest {candidates} {' and '.join(said.nearest)}, but the tests do not support {them}."
+def _not_established(summary: loop_notes.VerdictSummary) -> str:
+    """Effects in the model whose names are not established, or else the nearest candidates."""
+    if summary.missing or not summary.nearest:
+        return _tentative(summary)
+    candidates, them = ("candidate is", "it") if len(summary.nearest) == 1 else ("candidates are", "them")
+    return f" The nearest {candidates} {' and '.join(summary.nearest)}, but the tests do not support {them}."
 
 
 def _missed(m: loop_notes.MissedChannel) -> str:
@@ -100,19 +100,19 @@ def _missed(m: loop_notes.MissedChannel) -> str:
     return f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
 
 
-def loop_answer(found: loop_notes.Headline) -> str:
+def loop_answer(headline: loop_notes.Headline) -> str:
     """Answer of the loop: the deepest claim that holds at every noise factor tried.
 
     Terminal, page, result.json and robot files state this sentence, and no other level.
     """
-    *first, last = [f"{f:g}" for f in found.factors]
+    *first, last = [f"{f:g}" for f in headline.factors]
     noises = f" at {', '.join(first)} and {last} times the noise" if first else ""
-    claims = [c[: n or len(c)] for c, n in zip(found.claims, found.shared, strict=False)]
-    lacks = _are_missing([" or ".join(map(with_article, sure)) for sure in claims] or ["something"])
-    laws = [_law(*law) for law in zip(found.claims, found.families, found.values, strict=False)]
-    apart = "".join(
+    claims = [c[: n or len(c)] for c, n in zip(headline.claims, headline.shared, strict=False)]
+    missing = _are_missing([" or ".join(map(with_article, sure)) for sure in claims] or ["something"])
+    laws = [_law(*law) for law in zip(headline.claims, headline.families, headline.values, strict=False)]
+    alternatives = "".join(
         f" At some of these noise levels it may be {' or '.join(map(with_article, c[n:]))} instead."
-        for c, n in zip(found.claims, found.shared, strict=False)
+        for c, n in zip(headline.claims, headline.shared, strict=False)
         if n and c[n:]
     )
     return {
@@ -120,9 +120,9 @@ def loop_answer(found: loop_notes.Headline) -> str:
         "undescribed": f"No verdict{noises}: {UNDESCRIBED}.",
         "open": f"Perhaps. The answers{noises} differ: whether anything is missing depends on the noise.",
         **dict.fromkeys(("named", "class"), f"No: {_are_missing(laws)}{noises}."),
-        "mechanism": f"No: {lacks}{noises}.{apart} Its exact law is not established.",
-        "place": f"No: {lacks}{noises}.{apart} No more is established.",
-    }[found.level]
+        "mechanism": f"No: {missing}{noises}.{alternatives} Its exact law is not established.",
+        "place": f"No: {missing}{noises}.{alternatives} No more is established.",
+    }[headline.level]
 
 
 def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.AlternativeValue]) -> str:
@@ -148,20 +148,20 @@ def _are_missing(nouns: Sequence[str]) -> str:
     return f"{' and '.join(nouns)} {'is' if len(nouns) == 1 else 'are'} missing"
 
 
-def _undescribed(said: loop_notes.VerdictSummary) -> str:
+def _undescribed(summary: loop_notes.VerdictSummary) -> str:
     """Sentence on a model that does not describe the runs: the misfit and the checks."""
-    place_words = [
+    misses = [
         _missed(m) + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
-        for m in said.missed
+        for m in summary.missed
     ]
-    check = [f"unused columns that vary ({', '.join(said.unused)})"] * bool(said.unused)
-    check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
-    check += ["units, signs and sides of columns"]
-    if not place_words:
+    checks = [f"unused columns that vary ({', '.join(summary.unused)})"] * bool(summary.unused)
+    checks += [f"parameters far from their priors ({', '.join(summary.far)})"] * bool(summary.far)
+    checks += ["units, signs and sides of columns"]
+    if not misses:
         return f"{UNDESCRIBED.capitalize()}: it lacks backlash. Add backlash first."
     return (
-        f"{UNDESCRIBED.capitalize()}: after the refit, it misses {', '.join(place_words)}. Check "
-        f"first: {', and '.join(check)}."
+        f"{UNDESCRIBED.capitalize()}: after the refit, it misses {', '.join(misses)}. Check "
+        f"first: {', and '.join(checks)}."
     )
 
 
@@ -182,16 +182,16 @@ NO_MECHANISM = {
 }
 
 
-def no_mechanism(found: loop_notes.Mechanism) -> str:
+def no_mechanism(mechanism: loop_notes.Mechanism) -> str:
     """Reasons against the best mechanism."""
     parts = {
-        "share": 100 * found.share,
-        "again": 100 * found.again,
-        "many": found.candidates,
-        "changed": _changed_constant(found.changed, found.run),
+        "share": 100 * mechanism.share,
+        "again": 100 * mechanism.again,
+        "many": mechanism.candidates,
+        "changed": _changed_constant(mechanism.changed, mechanism.run),
     }
-    why = [NO_MECHANISM[name].format(found, **parts) for name in found.fails]
-    return f"the best candidate is a {found.families[0]}, but {' and '.join(why)}"
+    reasons = [NO_MECHANISM[name].format(mechanism, **parts) for name in mechanism.fails]
+    return f"the best candidate is a {mechanism.families[0]}, but {' and '.join(reasons)}"
 
 
 def curve_course(d: UnnamedDiscrepancy) -> str:
@@ -224,72 +224,72 @@ def _level(variable: str, x: float) -> str:
     return f"{float(f'{x / factor:.3g}'):g} {unit}".rstrip()
 
 
-def brief_verdict(said: loop_notes.VerdictSummary) -> str:
+def brief_verdict(summary: loop_notes.VerdictSummary) -> str:
     """Verdict, families of a mechanism, and the first name of each effect, marked established or tentative."""
     phrases = []
-    if said.verdict == "mechanism" and said.mechanism is not None:
-        phrases.append(" or ".join(said.mechanism.families))
+    if summary.verdict == "mechanism" and summary.mechanism is not None:
+        phrases.append(" or ".join(summary.mechanism.families))
     for word, established in (("established", True), ("tentative", False)):
-        names = [one.names[0] for one in said.missing if one.established == established]
+        names = [effect.names[0] for effect in summary.missing if effect.established == established]
         phrases += [f"{', '.join(names)} {word}"] * bool(names)
-    return ": ".join([said.verdict, *[", ".join(phrases)] * bool(phrases)])
+    return ": ".join([summary.verdict, *[", ".join(phrases)] * bool(phrases)])
 
 
-def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
+def at_other_noise(verdicts: Sequence[NoiseVerdict]) -> str:
     """The verdicts with other noise, in a sentence, empty for none."""
-    same: dict[str, list[str]] = {}
-    for one in found:
-        same.setdefault(brief_verdict(one.summary), []).append(f"{one.factor:g}")
+    factors_by_verdict: dict[str, list[str]] = {}
+    for verdict in verdicts:
+        factors_by_verdict.setdefault(brief_verdict(verdict.summary), []).append(f"{verdict.factor:g}")
     answers = [
-        f"with {' and with '.join(factors)} times the noise, the verdict is {words}"
-        for words, factors in same.items()
+        f"with {' and with '.join(factors)} times the noise, the verdict is {phrase}"
+        for phrase, factors in factors_by_verdict.items()
     ]
     return ", and ".join(answers)
 
 
-def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
-    """An effect, with what it cannot be told from."""
-    readings = [with_article(f) for f in one.families[1:] if f.startswith("reading")]
-    if len(one.names) + len(one.values) + len(readings) == 1:
-        return one.names[0]
-    family = f"{one.families[0]}, " if len(one.families) == 1 else ""
-    names = ", ".join(in_order_of_parts(one.names))
-    names_words = names if len(one.names) == 1 else f"one of {names}"
-    values = [freed_value(v) for v in one.values]
+def _effect_and_rivals(effect: loop_notes.MissingEffect) -> str:
+    """An effect, with the alternatives that the data cannot distinguish from it."""
+    readings = [with_article(f) for f in effect.families[1:] if f.startswith("reading")]
+    if len(effect.names) + len(effect.values) + len(readings) == 1:
+        return effect.names[0]
+    family = f"{effect.families[0]}, " if len(effect.families) == 1 else ""
+    names = ", ".join(in_order_of_parts(effect.names))
+    names_words = names if len(effect.names) == 1 else f"one of {names}"
+    values = [freed_value(v) for v in effect.values]
     return f"{family}{', or '.join([names_words, *values, *readings])} (these data cannot distinguish them)"
 
 
-def _tentative(said: loop_notes.VerdictSummary) -> str:
-    """Effects that are in the model without a name of their own, each with what speaks against it. All of them at a
-    verdict without a name.
+def _tentative(summary: loop_notes.VerdictSummary) -> str:
+    """Effects in the model whose names are not established, each with the reasons against it. All effects if the
+    verdict names none.
     """
-    words = [
-        f"{_effect_and_rivals(one)}, which {doubts}" if (doubts := effect_doubts(one.test))
-        else f"{_effect_and_rivals(one)} ({support_reasons(said.support)})"
-        for one in said.missing
-        if not one.established or said.verdict in WITHOUT_NAME
+    phrases = [
+        f"{_effect_and_rivals(effect)}, which {doubts}" if (doubts := effect_doubts(effect.test))
+        else f"{_effect_and_rivals(effect)} ({support_reasons(summary.support)})"
+        for effect in summary.missing
+        if not effect.established or summary.verdict in WITHOUT_NAME
     ]  # fmt: skip
-    return f" Tentative, kept because it improves predictions: {'; '.join(words)}." if words else ""
+    return f" Tentative, kept because it improves predictions: {'; '.join(phrases)}." if phrases else ""
 
 
 def verdict_line(stages: LoopStages) -> str:
     """The verdict at one noise level: `at one noise level: class, series_resistance or supply_sag`."""
-    sure = [" or ".join(members) for members in stages.members] or [
+    claims = [" or ".join(members) for members in stages.members] or [
         with_article(family) for family in stages.families
     ]
-    return f"at one noise level: {', '.join((stages.verdict, *sure))}"
+    return f"at one noise level: {', '.join((stages.verdict, *claims))}"
 
 
-def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
-    """Lines of the ranking by regression: whether an effect is missing, and the strongest, `brief` by name alone."""
-    method_words = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
-    if not found.missing:
+def ranking_lines(ranking: EffectRanking, brief: bool = False) -> list[str]:
+    """Lines of the ranking by regression: the answer and the strongest effects. With `brief`, only their names."""
+    method_words = f"by regression on {ranking.windows} windows of the log" if ranking.windows else "by regression"
+    if not ranking.missing:
         return [
             f"{method_words}, not yet confirmed: no effect of the library exceeds chance (family-wise p = "
-            f"{found.p_value:.2g})"
+            f"{ranking.p_value:.2g})"
         ]
-    first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
-    beyond = found.beyond_chance[:5]
+    first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(ranking.p_value)})"
+    beyond = ranking.beyond_chance[:5]
     if not beyond:
         return [f"{first}. No effect exceeds chance"]
     if brief:
@@ -302,20 +302,20 @@ def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
     return [f"{first}. Strongest effects, each added alone:", *lines]
 
 
-def regression_verdict(found: EffectRanking) -> str:
+def regression_verdict(ranking: EffectRanking) -> str:
     """Answer of a ranking to a loop without a verdict: never more than a mechanism, and the base parameters."""
-    alike = [e for e in found.beyond_chance if e.score >= found.beyond_chance[0].score - Settings.alternative]
+    alike = [e for e in ranking.beyond_chance if e.score >= ranking.beyond_chance[0].score - Settings.alternative]
     families = " or ".join(dict.fromkeys(with_article(e.family) for e in alike))
-    lacks = "something may be missing, but no effect explains it"
+    finding = "something may be missing, but no effect explains it"
     if alike:
-        lacks = f"perhaps {families} is missing ({' or '.join(e.name for e in alike)})"
-    lacks = lacks if found.missing else "no effect of the library exceeds chance"
-    numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
+        finding = f"perhaps {families} is missing ({' or '.join(e.name for e in alike)})"
+    finding = finding if ranking.missing else "no effect of the library exceeds chance"
+    numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in ranking.parameters.items())
     numbers = f". Parameters [SI]: {numbers}" if numbers else ""
-    return f"regression only, not confirmed: {lacks}{numbers}"
+    return f"regression only, not confirmed: {finding}{numbers}"
 
 
-#: Remark beside a regression that sees nothing, where the simulation does.
+#: Remark if a regression finds nothing missing but the simulation does.
 DISAGREES = "simulation disagrees: the refit leaves more error than chance"
 
 
@@ -327,34 +327,34 @@ def search_progress(effects: Sequence[str], families: Sequence[str]) -> str:
     )
 
 
-def _shown(where: DiscrepancyLocation) -> str:
+def _variable_phrase(where: DiscrepancyLocation) -> str:
     """Variable that shows a discrepancy, and equally significant others."""
-    well = [
+    similar = [
         variable_showing_discrepancy(v, where.by_duty).removeprefix("clearest when plotted ")
         for v in where.variables_alike
     ]
     return variable_showing_discrepancy(where.variable, where.by_duty) + (
-        f" (equally clear {', '.join(well)})" if well else ""
+        f" (equally clear {', '.join(similar)})" if similar else ""
     )
 
 
 def variable_showing_discrepancy(variable: str, by_duty: bool = False) -> str:
     """Variable that shows a discrepancy. `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
-    happens = bases.window_from_name(variable)
+    window = bases.window_from_name(variable)
     if variable == "side":
         return "different on the two sides"
-    if happens is None:
+    if window is None:
         return (
             f"clearest when plotted over {bases.variable_in_words(variable)}"
             if variable != "order"
             else "drifting from run to run"
         )
-    if happens.axis == "time":
-        return f"from {happens.low:.3g} to {happens.high:.3g} s after the start of the runs"
-    if happens.axis == "order":
-        return f"in runs {happens.low:.0f} to {happens.high:.0f}"
-    return f"in the runs at {happens.words}"
+    if window.axis == "time":
+        return f"from {window.low:.3g} to {window.high:.3g} s after the start of the runs"
+    if window.axis == "order":
+        return f"in runs {window.low:.0f} to {window.high:.0f}"
+    return f"in the runs at {window.words}"
 
 
 def freed_value(v: loop_notes.AlternativeValue) -> str:
@@ -363,7 +363,7 @@ def freed_value(v: loop_notes.AlternativeValue) -> str:
 
 
 def p_value(p: float) -> str:
-    """A p-value. A bound for a small one, since the bootstrap cannot resolve it."""
+    """A p-value. If it is small, an upper bound, because the bootstrap cannot resolve it."""
     if p > 0.01:
         return f"= {p:.2g}"
     step = 10.0 ** math.floor(math.log10(p))
@@ -372,22 +372,22 @@ def p_value(p: float) -> str:
 
 def cluster_sentence(c: OutlierCluster) -> str:
     """Sentence on the common level of outlying rows."""
-    place_words = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
-    return f"{c.inside} of {c.of} outlying rows cluster {place_words} (p = {c.p:.1g})"
+    position = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
+    return f"{c.inside} of {c.of} outlying rows cluster {position} (p = {c.p:.1g})"
 
 
 # --- the first screen -----------------------------------------------------------------------------------
 
 
-def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:
+def is_established(result: DiscoveryResult, effect: FoundEffect) -> bool:
     """True if the name of an effect is established."""
-    return found.support is None or found.support.established(effect.name)
+    return result.support is None or result.support.established(effect.name)
 
 
-def standing_of_effect(found: DiscoveryResult, effect: FoundEffect) -> str:
+def standing_of_effect(result: DiscoveryResult, effect: FoundEffect) -> str:
     """Standing of an effect, with its score and the threshold of chance."""
-    test = None if found.support is None else found.support.test_of(effect.name)
-    if is_established(found, effect):
+    test = None if result.support is None else result.support.test_of(effect.name)
+    if is_established(result, effect):
         evidence = "" if test is None else f": {test.root:.1f} σ (chance alone reaches {test.needed:.1f} σ)"
         if test is not None and test.shows_form:
             variable = bases.variable_in_words(test.over)
@@ -396,7 +396,7 @@ def standing_of_effect(found: DiscoveryResult, effect: FoundEffect) -> str:
     return f"tentative: it improves predictions, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
 
 
-def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -> Names:
+def brief_answer(result: DiscoveryResult, moved: Sequence[str], next_step: str) -> Names:
     """Lines printed below the answer: parameters far from their stated values, effects added, errors with the number
     of rows, and the next step.
 
@@ -404,19 +404,19 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
         moved: sentences on parameters far from their stated values.
     """
     added = [
-        f"{e.name} {effect_amplitude(e)}" + " (tentative)" * (not is_established(found, e)) for e in found.effects
+        f"{e.name} {effect_amplitude(e)}" + " (tentative)" * (not is_established(result, e)) for e in result.effects
     ]
     changes = f"Changed: {', and '.join(moved)}. " * bool(moved) + f"Added: {', '.join(added)}." * bool(added)
-    stated_errors, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
+    stated_errors, fitted = result.errors_as_stated, result.errors[0 if result.refit_alone else 1]
     errors = [
         f"{channels.find_channel(c).label} {percent_text(stated_errors[c])} → {percent_text(e)} %"
         for c, e in fitted.items()
         if e["rows"]
     ]
-    reached, total = max((int(e["rows"]) for e in stated_errors.values()), default=0), len(found.runs)
-    aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
-    few = f" (of the robot file as given, {reached} rows can be simulated)" * (reached < total)
-    rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
+    simulated, total = max((int(e["rows"]) for e in stated_errors.values()), default=0), len(result.runs)
+    aside = f", {len(result.outliers)} set aside as outliers" * bool(result.outliers)
+    unreached = f" (of the robot file as given, {simulated} rows can be simulated)" * (simulated < total)
+    rows = f"{int(result.included.sum())} of {total} rows are used{aside}{unreached}"
     return (
         *filter(None, [changes.rstrip()]),
         f"rms error, robot file as given → after the loop: {', '.join(errors)}. {rows}.",
@@ -425,46 +425,46 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
 
 
 def percent_text(error: Mapping[str, float | int]) -> str:
-    """The rms error of a channel [%]: a digit after the point, more for a small one, `-` without a row."""
+    """The rms error of a channel [%]: one decimal, one significant digit if small, `-` without rows."""
     percent = float(error["rms_percent"])
     if not error["rows"]:
         return "-"
     return f"{percent:.1f}" if percent == 0 or percent >= 0.095 else f"{percent:.1g}"
 
 
-def errors_of_written_robot(found: DiscoveryResult) -> list[str]:
+def errors_of_written_robot(result: DiscoveryResult) -> list[str]:
     """Errors of the written robot on fitted and on held-out rows, by kind of block, or "No"."""
-    when = 1 if found.written else 0
-    if found.headline.level == "undescribed":
+    when = 1 if result.written else 0
+    if result.headline.level == "undescribed":
         return [f"No: {UNDESCRIBED}."]
-    lines = [f"**These conditions**: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
-    for kind, error_pair in found.errors_held_out.items():
-        lines.append(f"**Another {blocks.kind_in_words(kind)}**: {_rms(error_pair[when], len(found.runs))}.")
+    lines = [f"**These conditions**: {_rms(result.errors[when], len(result.runs))}."] * bool(result.errors[when])
+    for kind, error_pair in result.errors_held_out.items():
+        lines.append(f"**Another {blocks.kind_in_words(kind)}**: {_rms(error_pair[when], len(result.runs))}.")
     return lines
 
 
 def _rms(errors: Errors, total: int) -> str:
-    """Largest rms error of any channel, the worst reading, and the rows reached if not all are."""
+    """Largest rms error of any channel, the worst reading, and the number of simulated rows if some failed."""
     non_empty = [e for e in errors.values() if e["rows"]]
     if not non_empty:
         return "no row can be simulated"
     rms, worst, rows = (max(float(e[name]) for e in non_empty) for name in ("rms_percent", "max_percent", "rows"))
-    few = f" ({rows:.0f} of {total} rows simulated)" if rows < total else ""
-    return f"rms error ≤ {rms:.1f} %, worst {worst:.1f} %{few}"
+    reached = f" ({rows:.0f} of {total} rows simulated)" if rows < total else ""
+    return f"rms error ≤ {rms:.1f} %, worst {worst:.1f} %{reached}"
 
 
-def largest_share(found: DiscoveryResult) -> str:
-    """The reading that weighs most in what is left, empty where none stands out."""
-    readings, runs = found.readings_of_rows, found.runs
-    after = readings.after if found.written else readings.before
-    squares = np.where(found.included[:, None], ((after - readings.measured) / readings.sd) ** 2, np.nan)
+def largest_share(result: DiscoveryResult) -> str:
+    """The reading with the largest share of the remaining misfit. Empty if that share is below `SHARE`."""
+    readings, runs = result.readings_of_rows, result.runs
+    after = readings.after if result.written else readings.before
+    squares = np.where(result.included[:, None], ((after - readings.measured) / readings.sd) ** 2, np.nan)
     total = float(np.nansum(squares))
     if not total > 0 or (share := 100 * float(np.nanmax(squares)) / total) < SHARE:
         return ""
     row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
     columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
-    place_words, label = _conditions(columns), found.channels[k].label
-    return f"Row {found.numbers[row]} ({place_words}): its {label} causes {share:.0f} % of the remaining misfit"
+    conditions, label = _conditions(columns), result.channels[k].label
+    return f"Row {result.numbers[row]} ({conditions}): its {label} causes {share:.0f} % of the remaining misfit"
 
 
 def _conditions(columns: Mapping[str, str | float]) -> str:
@@ -472,7 +472,7 @@ def _conditions(columns: Mapping[str, str | float]) -> str:
     return ", ".join(str(x) if isinstance(x, str) else f"{x:g} {c.rpartition('_')[2]}" for c, x in columns.items())
 
 
-#: Share of what is left from which one reading is worth a look [%].
+#: Smallest share of the remaining misfit for which a reading is reported [%].
 SHARE = 10.0
 
 
@@ -480,20 +480,20 @@ def _begun_from(robot_name: str) -> str:
     return f" from {robot_name}" if robot_name else ""
 
 
-def proposed_header(found: DiscoveryResult, robot_name: str) -> str:
+def proposed_header(result: DiscoveryResult, robot_name: str) -> str:
     """Header of the proposed robot's file."""
-    return f"found by the loop{_begun_from(robot_name)} with {found.runs.source}: {found.statement}"
+    return f"found by the loop{_begun_from(robot_name)} with {result.runs.source}: {result.statement}"
 
 
-def refit_header(found: DiscoveryResult, robot_name: str) -> str:
+def refit_header(result: DiscoveryResult, robot_name: str) -> str:
     """Header of the refitted robot's file."""
-    return f"fitted by the loop{_begun_from(robot_name)} to {found.runs.source}, with no effect added"
+    return f"fitted by the loop{_begun_from(robot_name)} to {result.runs.source}, with no effect added"
 
 
-#: In the place of a formula.
+#: Sentence if there is no formula.
 NO_FORMULA = "no single term explains 90 % of the curve"
 
-# --- whether names stand --------------------------------------------------------------------------------
+# --- support of names -----------------------------------------------------------------------------------
 
 #: Reasons for or against names.
 REASONS = {
@@ -519,12 +519,12 @@ def support_reasons(support: loop_notes.NameSupport | None) -> str:
     )
 
 
-def naming_reasons(found: DiscoveryResult) -> str:
+def naming_reasons(result: DiscoveryResult) -> str:
     """Reasons for or against the names. A curve that explains everything comes first."""
-    reasons, lacks = support_reasons(found.support), found.unnamed
-    if lacks is None or not found.adequate_after or (found.support is not None and found.support.curves):
+    reasons, discrepancy = support_reasons(result.support), result.unnamed
+    if discrepancy is None or not result.adequate_after or (result.support is not None and result.support.curves):
         return reasons
-    placed_curve = loop_notes.PlacedCurve(lacks.place, (lacks.variable,))
+    placed_curve = loop_notes.PlacedCurve(discrepancy.place, (discrepancy.variable,))
     return "; ".join([REASONS["curve alone"].format(curves=_curve(placed_curve)), *[reasons] * bool(reasons)])
 
 
@@ -556,9 +556,9 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     """Reasons against an effect, empty for none."""
     if test is None or not test.fails:
         return ""
-    curve_words = ", ".join(_place_over(c.place, *c.variables) for c in test.curves)
+    curves = ", ".join(_place_over(c.place, *c.variables) for c in test.curves)
     doubts = {
-        "beside": curve_words and f" next to smooth curves ({curve_words})",
+        "beside": curves and f" next to smooth curves ({curves})",
         "larger": " and ".join(test.larger),
         "changed": _changed_constant(test.changed, test.row),
     }
@@ -579,13 +579,13 @@ def _place_over(place: str, *variables: str) -> str:
     return f"{bases.place_in_words(place)} over {' and '.join(map(bases.variable_in_words, variables))}"
 
 
-def support_sentence(found: DiscoveryResult) -> str:
+def support_sentence(result: DiscoveryResult) -> str:
     """Sentence on the support of names, empty without one."""
-    if not found.standing:
+    if not result.standing:
         return ""
-    if found.verdict in WITHOUT_NAME:
-        return f"Why no name: {found.standing}."
-    return f"{found.standing[0].upper()}{found.standing[1:]}."
+    if result.verdict in WITHOUT_NAME:
+        return f"Why no name: {result.standing}."
+    return f"{result.standing[0].upper()}{result.standing[1:]}."
 
 
 #: Reasons why an effect is not plausible.
@@ -601,7 +601,7 @@ def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
     return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
 
 
-# --- beside names ---------------------------------------------------------------------------------------
+# --- other findings -------------------------------------------------------------------------------------
 
 
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
@@ -617,9 +617,9 @@ def effect_amplitude(e: FoundEffect) -> str:
     return f"{amplitude.value:.3g} ± {amplitude.sd:.2g} {amplitude.unit}".rstrip(" -")
 
 
-def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
+def indistinguishable_effects(result: DiscoveryResult, e: FoundEffect) -> str:
     """Effects and stated values that these data do not distinguish from an effect."""
-    settled = [x.name for x in effects.ALL if x.settles_to in e.members and not found.runs.sampled]
+    settled = [x.name for x in effects.ALL if x.settles_to in e.members and not result.runs.sampled]
     others = ", ".join(
         [
             name
@@ -636,7 +636,7 @@ def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
     return ", or ".join(words for words in (others, values) if words)
 
 
-def rising_errors_sentence(found: Sequence[WorseChannel], predicted: Mapping[str, tuple[int, int]]) -> str:
+def rising_errors_sentence(worse: Sequence[WorseChannel], predicted: Mapping[str, tuple[int, int]]) -> str:
     """Sentence on errors that rise and on rows that are no longer predicted, empty for none.
 
     Args:
@@ -644,12 +644,12 @@ def rising_errors_sentence(found: Sequence[WorseChannel], predicted: Mapping[str
     """
     parts = []
     for kind, (before, after) in predicted.items():
-        own_windows = [w for w in found if w.kind == kind]
+        worse_of_kind = [w for w in worse if w.kind == kind]
         changes = [
-            f"{channels.find_channel(w.channel).label} {_two_numbers(w.before, w.after)} %" for w in own_windows
+            f"{channels.find_channel(w.channel).label} {_two_numbers(w.before, w.after)} %" for w in worse_of_kind
         ]
-        if own_windows:
-            changes[-1] += f" (same {min(w.rows for w in own_windows)} rows)"
+        if worse_of_kind:
+            changes[-1] += f" (same {min(w.rows for w in worse_of_kind)} rows)"
         if before > after:
             changes.append(f"{count_noun(before - after, 'row')} can no longer be predicted")
         if changes:
@@ -658,7 +658,7 @@ def rising_errors_sentence(found: Sequence[WorseChannel], predicted: Mapping[str
 
 
 def _two_numbers(before: float, after: float) -> str:
-    """Two numbers with as many digits as tell them apart."""
+    """Two numbers with the fewest digits that show their difference."""
     texts = [(f"{before:.{k}f}", f"{after:.{k}f}") for k in range(1, 6)]
     return " → ".join(next((pair for pair in texts if pair[0] != pair[1]), texts[-1]))
 
@@ -731,8 +731,8 @@ def sentence_on_single_run(
     beside: tuple[float, ...] = (),
 ) -> str:
     """Sentence on an effect that depends on one row."""
-    place_words = _conditions(conditions)
-    row = f"row {test.row}{f' ({place_words})' * bool(place_words)}"
+    conditions_words = _conditions(conditions)
+    row = f"row {test.row}{f' ({conditions_words})' * bool(conditions_words)}"
     others = (
         f"add runs at {axis} {' and '.join(f'{x:g}' for x in beside)}" if beside else "add runs on either side of it"
     )
@@ -777,7 +777,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         "lower"
     ),
     "unwritten": lambda curve, gain, se: (
-        f"{'the curve' if curve else 'what was found'} predicts held-out runs "
+        f"{'the curve' if curve else 'the proposed model'} predicts held-out runs "
         f"{'no better' if curve and gain > 0 else 'worse'} than the refit (log likelihood {gain:+.2f} ± {se:.2f} per "
         "reading), so robot.toml is the refit"
     ),
