@@ -41,7 +41,7 @@ T = TypeVar("T")
 SCREENING = "mmrjax.screening/1"
 
 
-def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
+def execute(config: configuration.Loop, options: configuration.LoopBeside) -> int:
     """Runs the closed loop on a table and writes a run folder. Returns the exit code: 0 for any verdict, 3 if the
     proposed fit did not converge, or if the time budget ended before a verdict. Finished stages are stored, so that
     the same command continues after such an end or an interrupt. For a model of several joints, each joint has its
@@ -50,47 +50,45 @@ def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int
     if config.model is not None:
         from sweeps.commands import loop_joints
 
-        return loop_joints.run_joints(config, beside, _run_with_time_limit)
+        return loop_joints.run_joints(config, options, _run_with_time_limit)
     robot = load_robot(config).robot
     return _run_with_time_limit(
-        config, beside, robot, read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
+        config, options, robot, read_runs(options.data, robot, columns=config.columns, measured=True, series=True)
     )
 
 
 def _run_with_time_limit(
-    config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs
+    config: configuration.Loop, options: configuration.LoopBeside, robot: Robot, runs: Runs
 ) -> int:
     try:
-        return _run_loop(config, beside, robot, runs)
+        return _run_loop(config, options, robot, runs)
     except OutOfTime:
         return SOLVER_FAILED
 
 
-def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
-    began, time_budget = time.monotonic(), beside.seconds
+def _run_loop(config: configuration.Loop, options: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
+    start, time_budget = time.monotonic(), options.seconds
     prior_options = priors.parse_priors(config.prior)
     replicates = max(config.replicates, fewest_replicates(observers.observer_kind(runs)))
 
     stages: dict[str, Any] = {}
 
-    def left() -> float:
-        return max(time_budget - (time.monotonic() - began), 0.0)
+    def seconds_left() -> float:
+        return max(time_budget - (time.monotonic() - start), 0.0)
 
     def timed(text: str) -> None:
-        elapsed = time.monotonic() - began
-        seconds_left = expected_time(text, elapsed)
-        print_message(
-            f"{elapsed:4.0f} s  {text}{'' if seconds_left is None else f' (about {seconds_left:.0f} s more)'}"
-        )
+        elapsed = time.monotonic() - start
+        expected = expected_time(text, elapsed)
+        print_message(f"{elapsed:4.0f} s  {text}{'' if expected is None else f' (about {expected:.0f} s more)'}")
 
     with (
-        open_folder("loop", config, robot, beside, runs) as folder,
-        step_reporter(timed, "preparing the table") as heard,
+        open_folder("loop", config, robot, options, runs) as folder,
+        step_reporter(timed, "preparing the table") as report_step,
     ):
 
         def progress(text: str) -> None:
-            heard(text)
-            if left() == 0.0 and "verdict" not in stages:
+            report_step(text)
+            if seconds_left() == 0.0 and "verdict" not in stages:
                 raise OutOfTime
 
         def keep(name: str, make: Callable[[], T]) -> T:
@@ -98,7 +96,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             if name == "ranking":
                 # The ranking by regression is the first answer.
                 ranking: findings.EffectRanking = stages[name]
-                first_line, *lines = loop_words.ranking_lines(ranking, brief=not beside.verbose)
+                first_line, *lines = loop_words.ranking_lines(ranking, brief=not options.verbose)
                 timed(first_line)
                 for line in lines:
                     print_message(line)
@@ -110,11 +108,11 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             return result
 
         try:
-            with _time_limit(left(), lambda: "verdict" not in stages):
+            with _time_limit(seconds_left(), lambda: "verdict" not in stages):
                 verdict = discover(
                     runs, robot, rows=config.rows, noise=config.noise or None, stated=prior_options,
                     library=effect_file.effect_library(config.effects), replicates=replicates, seed=config.seed,
-                    forbidden=config.forbid, progress=progress, keep=keep, left=left,
+                    forbidden=config.forbid, progress=progress, keep=keep, left=seconds_left,
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
@@ -126,7 +124,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             _report_stored_stages(stages, folder, config.robot)
             raise
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
-        page = print_report(document, brief=not beside.verbose)
+        page = print_report(document, brief=not options.verbose)
         verdict.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")
@@ -135,8 +133,8 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
 
 
 @contextlib.contextmanager
-def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
-    """Context manager that raises `OutOfTime` in its block after this many seconds while `wanted` is true.
+def _time_limit(seconds: float, is_limited: Callable[[], bool]) -> Iterator[None]:
+    """Context manager that raises `OutOfTime` in its block after this many seconds while `is_limited` is true.
 
     On some platforms it also interrupts a running step, and repeats this every second, because a called function may
     suppress the exception.
@@ -146,7 +144,7 @@ def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
         return
 
     def ring(*_: Any) -> None:
-        if wanted():
+        if is_limited():
             raise OutOfTime
 
     handler_before = signal.signal(signal.SIGALRM, ring)
@@ -191,26 +189,26 @@ def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_na
     print_message(f"the best result so far is the refit, {folder.partial / REFIT_FILE}")
 
 
-def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
+def changes_by_effect(result: DiscoveryResult) -> dict[str, Change]:
     """Change of settled runs by each effect of the written robot. Empty for histories."""
-    added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
-    if not isinstance(found.detail, EquationErrors) or not added:
+    added = [e.name for e in result.effects if e.name in {x.name for x in result.robot.effects}]
+    if not isinstance(result.detail, EquationErrors) or not added:
         return {}
-    conditions = found.runs.conditions(found.robot)
+    conditions = result.runs.conditions(result.robot)
 
     def simulated(robot: Robot) -> Columns:
         results = mm.simulate(robot, conditions)
-        return {c.name: np.asarray(getattr(results, c.name)) for c in found.channels}
+        return {c.name: np.asarray(getattr(results, c.name)) for c in result.channels}
 
-    with_it, most, measured = simulated(found.robot), {}, found.readings_of_rows.measured
+    with_effects, largest, measured = simulated(result.robot), {}, result.readings_of_rows.measured
     for name in added:
-        without = simulated(params.replace(found.robot, {f"effects.{name}.amplitude": params.as_float(0.0)}))
+        without = simulated(params.replace(result.robot, {f"effects.{name}.amplitude": params.as_float(0.0)}))
         changes = []
-        for k, c in enumerate(found.channels):
-            a, b = without[c.name], with_it[c.name]
-            size = root_mean_square(measured[found.included, k])
+        for k, c in enumerate(result.channels):
+            a, b = without[c.name], with_effects[c.name]
+            size = root_mean_square(measured[result.included, k])
             if np.isfinite(size) and size > 0:
-                changes.append(Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
+                changes.append(Change(c, 100 * root_mean_square((b - a)[result.included]) / size, a, b))
         if changes:
-            most[name] = max(changes, key=lambda change: change.rms)
-    return most
+            largest[name] = max(changes, key=lambda change: change.rms)
+    return largest

@@ -44,7 +44,7 @@ SD = "motor_current_sd_A"
 #: Smallest speed whose direction is certain, in sds of the speed. Smallest change that counts as a jump, in sds.
 CERTAIN, JUMP = 2.0, 6.0
 #: Temporary columns of a joint's table: error of the torque [A] and smallest certain speed [rpm].
-DOUBTS = ("error of torque", "least speed")
+ERROR_COLUMNS = ("error of torque", "least speed")
 #: Fewest readings in a run for smoothing its motion.
 FEWEST = 12
 #: Median of the magnitude of sixth differences of white noise [sd].
@@ -87,12 +87,12 @@ class Chain:
         Args:
             motion: angles [rad], speeds and accelerations, shape (3, rows, joints).
         """
-        data, needed = self.library.MjData(self.model), np.empty_like(motion[0])
-        for row in range(len(needed)):
+        data, torques = self.library.MjData(self.model), np.empty_like(motion[0])
+        for row in range(len(torques)):
             data.qpos[:], data.qvel[:], data.qacc[:] = motion[:, row]
             self.library.mj_inverse(self.model, data)
-            needed[row] = data.qfrc_inverse
-        return needed
+            torques[row] = data.qfrc_inverse
+        return torques
 
 
 def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> tuple[np.ndarray, int]:
@@ -158,9 +158,9 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
                     f"least {FEWEST} with increasing time_s"
                 )
             readings = time[finite_rows], angle[finite_rows], time[rows]
-            motion[:, rows, k], more = smoothed_motion(*readings, degree=5)
+            motion[:, rows, k], knot_count = smoothed_motion(*readings, degree=5)
             cubic[:, rows, k], _ = smoothed_motion(*readings, degree=3)
-            knots[k] += more
+            knots[k] += knot_count
     return motion, cubic, int(knots.max())
 
 
@@ -183,7 +183,7 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
     motion, cubic, knots = smoothed_log(log, chain)
     torques, cubic_torques = chain.torques(motion), chain.torques(cubic)
     rows_per_knot = round(len(log) / knots)  # rows from knot to knot
-    doubts = [
+    errors = [
         maximum_filter1d(np.abs(x), 4 * rows_per_knot + 1, axis=0)
         for x in (torques - cubic_torques, motion[1] - cubic[1])
     ]
@@ -197,26 +197,31 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
         columns = {
             LOAD: torques[:, k] - float(load.inertia) * acceleration - np.asarray(load.torque_load(angle)),
             SPEED: speed * ratio / RPM,
-            **{DOUBTS[0]: doubts[0][:, k] / per_ampere, DOUBTS[1]: CERTAIN * doubts[1][:, k] * ratio / RPM},
+            **{
+                ERROR_COLUMNS[0]: errors[0][:, k] / per_ampere,
+                ERROR_COLUMNS[1]: CERTAIN * errors[1][:, k] * ratio / RPM,
+            },
         }
         table = records.runs_of_arrays(joint.with_columns(columns), robot=robot)
-        doubt, least = (table.extras[c] for c in DOUBTS)
+        torque_error, least_speed = (table.extras[c] for c in ERROR_COLUMNS)
         (noise,) = estimate_noise(table, sizes := observer_kind(table).sizes(table))
         noise_sd = np.zeros(len(table)) if noise is None else noise.sd(sizes[:, 0])
         change = np.abs(np.diff(table[CURRENT], prepend=np.nan))
         jump = np.where(change > JUMP * noise_sd, change, 0.0)
-        spread = np.sqrt(maximum_filter1d(jump, 2 * rows_per_knot + 1) ** 2 + doubt**2 + noise_sd**2)
-        certain = np.abs(table[SPEED]) > least
-        columns = {SD: spread, **table.columns, CURRENT: np.where(certain, table[CURRENT], np.nan)}
-        note = f"{joint.name}: {np.sum(~certain)} of {len(table)} readings of the current are left out, because the "
+        current_sd = np.sqrt(maximum_filter1d(jump, 2 * rows_per_knot + 1) ** 2 + torque_error**2 + noise_sd**2)
+        is_certain = np.abs(table[SPEED]) > least_speed
+        columns = {SD: current_sd, **table.columns, CURRENT: np.where(is_certain, table[CURRENT], np.nan)}
+        note = (
+            f"{joint.name}: {np.sum(~is_certain)} of {len(table)} readings of the current are left out, because the "
+        )
         table = dataclasses.replace(
             table,
             columns=columns,
-            unknown=tuple(c for c in table.unknown if c not in DOUBTS),
-            extras={c: x for c, x in table.extras.items() if c not in DOUBTS},
+            unknown=tuple(c for c in table.unknown if c not in ERROR_COLUMNS),
+            extras={c: x for c, x in table.extras.items() if c not in ERROR_COLUMNS},
             notes=(*table.notes, f"{note}direction of the speed is uncertain"),
         )
-        runs[name] = thin_rows(table, knots) if np.median(doubt) > np.median(noise_sd) else table
+        runs[name] = thin_rows(table, knots) if np.median(torque_error) > np.median(noise_sd) else table
     return runs
 
 
@@ -228,21 +233,21 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
             current.
     """
     robot_name = f"{JOINT}.toml" if config.robot == "nominal" else config.robot
-    one = config.model_copy(update={"robot": robot_name.replace(JOINT, joint), "joints": (joint,)})
-    robot = load_robot(one).robot
-    rig, shaft = robot.rig, not robot.has_ground and len(robot.configurations.members) == 1
-    if not shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
+    joint_config = config.model_copy(update={"robot": robot_name.replace(JOINT, joint), "joints": (joint,)})
+    robot = load_robot(joint_config).robot
+    rig, is_shaft = robot.rig, not robot.has_ground and len(robot.configurations.members) == 1
+    if not is_shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
         raise BadConfiguration(
-            f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" '
-            f'and channels = ["motor_current"]; mmrjax rig new {joint}.toml --from {config.model} --joint '
-            f"{joint} --kind bench writes a template"
+            f'--robot {joint_config.robot}: expected the rig of one joint with load = "shaft", imposed = '
+            f'"motor_speed" and channels = ["motor_current"]; mmrjax rig new {joint}.toml --from {config.model} '
+            f"--joint {joint} --kind bench writes a template"
         )
-    return one, robot
+    return joint_config, robot
 
 
 def run_joints(
     config: configuration.Loop,
-    beside: configuration.LoopBeside,
+    options: configuration.LoopBeside,
     loop: Callable[[configuration.Loop, configuration.LoopBeside, Robot, Runs], int],
 ) -> int:
     """Runs the loop of each joint in its own folder, and writes one page. Finished joints are kept.
@@ -258,7 +263,7 @@ def run_joints(
         BadData: the file does not exist, or as in `runs_of_joints`.
     """
     assert config.model is not None
-    chain, data = Chain(config.model), Path(beside.data)
+    chain, data = Chain(config.model), Path(options.data)
     joint_names = chain.driven if config.joints == ("all",) else config.joints
     unknown = next((name for name in joint_names if name not in chain.names), "" if joint_names else "all")
     if unknown:
@@ -271,18 +276,18 @@ def run_joints(
         raise BadData(f"{data}: no such file; expected a log of the joints of {config.model.name}")
     log = reading.read_whole_table(data)
     runs = runs_of_joints(log, chain, {name: robot for name, (_, robot) in robots.items()})
-    folder = beside.out or store.default_path("loop")
+    folder = options.out or store.default_path("loop")
     code, rows = 0, []
-    for name, (one, robot) in robots.items():
+    for name, (joint_config, robot) in robots.items():
         run_folder, table = folder / name, runs[name]
-        is_finished = not beside.force and store.is_finished(
-            run_folder, store.run_identity("loop", one, robot, table)
+        is_finished = not options.force and store.is_finished(
+            run_folder, store.run_identity("loop", joint_config, robot, table)
         )
         print_message(f"joint {name}{f': finished in {run_folder}, kept' if is_finished else ''}")
         for note in table.notes:
             print_message(note)
         if not is_finished:
-            code = max(code, loop(one, beside.model_copy(update={"out": run_folder}), robot, table))
+            code = max(code, loop(joint_config, options.model_copy(update={"out": run_folder}), robot, table))
         rows.append(_row(name, run_folder))
     answer = " ".join(f"{name}: {answer}" for name, answer, *_ in rows)
     document = Document(f"Joints of {config.model.name}", answer, (catalogue.table("loop.joints", rows),))
@@ -291,13 +296,13 @@ def run_joints(
     return code
 
 
-def _row(joint: str, place: Path) -> tuple[str, str, str, str]:
+def _row(joint: str, folder: Path) -> tuple[str, str, str, str]:
     """Row of a joint: its name, answer, held-out errors and page."""
-    if not (place / "result.json").is_file():
-        ranked = place.with_name(f"{joint}.partial") / store.SCREENING_FILE
-        answer = json.loads(ranked.read_text(encoding="utf-8"))["answer"] if ranked.is_file() else ""
+    if not (folder / "result.json").is_file():
+        screening = folder.with_name(f"{joint}.partial") / store.SCREENING_FILE
+        answer = json.loads(screening.read_text(encoding="utf-8"))["answer"] if screening.is_file() else ""
         return joint, f"no verdict in time. The same command continues. So far: {answer}.", "", ""
-    result: Mapping = json.loads((place / "result.json").read_text(encoding="utf-8"))
+    result: Mapping = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     held_out = (result["errors"][fit]["held_out"] for fit in ("before", "after"))
     percent = [next(iter(x.values()))["rms_percent"] if x else None for x in held_out]  # of the current
     errors = "" if None in percent else " → ".join(f"{x:.3g}" for x in percent)

@@ -94,10 +94,10 @@ SMOOTH = 0.02
 
 def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
     """Imposed quantity of runs and its label. For a supply with a driver, the voltage after the duty."""
-    own_column = imposed_column(table)
-    if own_column == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
-        return table[own_column] * table["duty"], "voltage given to the motors [V]"
-    return table[own_column], axis_title(own_column)
+    column = imposed_column(table)
+    if column == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
+        return table[column] * table["duty"], "voltage given to the motors [V]"
+    return table[column], axis_title(column)
 
 
 def roughness(x: np.ndarray, y: np.ndarray) -> float:
@@ -120,8 +120,8 @@ def conditions_and_readings(table: Columns) -> Columns:
     columns |= {axis_title(name): table[name] for name in names if name in table}
     if "duty_left" in table and "supply_voltage_V" in table:
         columns |= {f"voltage, {s} [V]": table["supply_voltage_V"] * table[f"duty_{s}"] for s in SIDES}
-    values, words = imposed_axis(table)
-    columns |= {words: values}
+    values, imposed_label = imposed_axis(table)
+    columns |= {imposed_label: values}
     for label, column in list(columns.items()):
         if (right := columns.get(label.replace(", left", ", right"))) is not None and ", left" in label:
             side_label = label.replace(", left", "")
@@ -152,50 +152,50 @@ def _turns_once(values: np.ndarray) -> bool:
     return len(values) > 1 and int(np.count_nonzero(np.diff(np.sign(np.diff(values))))) <= 1
 
 
-def draw_effect_law(found: DiscoveryResult, table: Columns, name: str, change: Change) -> Figure:
+def draw_effect_law(result: DiscoveryResult, table: Columns, name: str, change: Change) -> Figure:
     """Law of an effect found, over its condition: readings minus those of the robot without the effect.
 
     The figure shows measurements with ±2 sd, the refit without effects, and the law with the 95 % band of its
     amplitude. Backward runs have hollow dots and their own line.
     """
     fig, ((axes,),) = new_figure(1, 1, 3.4)
-    readings, used, c = found.readings_of_rows, found.included, change.channel
+    readings, included, c = result.readings_of_rows, result.included, change.channel
     effect = BY_NAME.get(name)
     x, label = driving_variable(
-        table, np.where(used, change.with_it - change.without, np.nan), "" if effect is None else effect.driver
+        table, np.where(included, change.with_it - change.without, np.nan), "" if effect is None else effect.driver
     )
-    k = [x.name for x in found.channels].index(c.name)
-    size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
+    k = [x.name for x in result.channels].index(c.name)
+    amplitude = next(e.parameters["amplitude"] for e in result.effects if e.name == name)
     measured, before, law = (
-        (values - change.without)[used] / c.factor
+        (values - change.without)[included] / c.factor
         for values in (readings.measured[:, k], readings.before[:, k], change.with_it)
     )
     imposed, imposed_label = imposed_axis(table)
-    backward, imposed = (table[imposed_column(table)] < 0)[used], imposed[used]
-    x, sd, share = x[used], readings.sd[used, k] / c.factor, 196 * abs(size.sd / size.value)
+    backward, imposed = (table[imposed_column(table)] < 0)[included], imposed[included]
+    x, sd, share = x[included], readings.sd[included, k] / c.factor, 196 * abs(amplitude.sd / amplitude.value)
     band = share / 100 * abs(law)
     axes.axhline(0, color=FAINT, lw=0.8)
-    old_words: str | None = "old law, refitted"
-    for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
+    refit_label: str | None = "old law, refitted"
+    for way, face, points_label in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
         if not way.any():
             continue
         rows = np.flatnonzero(way)[np.argsort(x[way])]
-        axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
-                      label=words)  # fmt: skip
-        axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label=old_words)
+        axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=face, color=ORANGE, lw=0.9,
+                      label=points_label)  # fmt: skip
+        axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label=refit_label)
         is_line = _turns_once(law[rows]) or roughness(x[rows], law[rows]) < SMOOTH
         lines = [rows] if is_line else [rows[imposed[rows] == level] for level in np.unique(imposed[rows])]
         by_level = "" if is_line else f" by {imposed_label.partition(' [')[0]}"
-        law_words = f"new law{by_level}, 95 % band (±{share:.2g} %)" if old_words else None
+        law_label = f"new law{by_level}, 95 % band (±{share:.2g} %)" if refit_label else None
         for line in lines:
             if is_line or _turns_once(law[line]):
-                axes.plot(x[line], law[line], color=BLUE, lw=1.2, label=law_words)
+                axes.plot(x[line], law[line], color=BLUE, lw=1.2, label=law_label)
                 axes.fill_between(x[line], (law - band)[line], (law + band)[line], color=BLUE, alpha=0.3, lw=0)
             else:
                 axes.errorbar(x[line], law[line], band[line], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
-                              alpha=0.6, label=law_words)  # fmt: skip
-            law_words = None
-        old_words = None  # the legend names each law once
+                              alpha=0.6, label=law_label)  # fmt: skip
+            law_label = None
+        refit_label = None  # the legend names each law once
     axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
     outer_legend(axes, "upper left")
     return fig
@@ -220,12 +220,12 @@ def _defect_variable(table: Columns, column: str, label: str, side: str = "") ->
 
     The imposed quantity replaces a variable that the table lacks or that does not vary.
     """
-    own_column = imposed_column(table)
+    imposed = imposed_column(table)
     if side:
         column = f"motor_current_{side}_A" if column == "current_A" else f"motor_speed_{side}_rpm"
         label = f"motor {'current' if 'current' in column else 'speed'} of that side [{column.rpartition('_')[2]}]"
     column = "total_" + column if column == "current_A" else column
-    if column not in table or (column not in ("total_current_A", own_column) and np.unique(table[column]).size == 1):
+    if column not in table or (column not in ("total_current_A", imposed) and np.unique(table[column]).size == 1):
         return imposed_axis(table)
     return table[column], label
 
@@ -263,22 +263,22 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
     return fig
 
 
-def draw_unnamed_curve(found: UnnamedDiscrepancy) -> Figure:
+def draw_unnamed_curve(discrepancy: UnnamedDiscrepancy) -> Figure:
     """The unnamed defect, run by run over the variable that shows it best, with the smooth curve and its band."""
-    variable = found.variable if found.window is None else str(found.window["axis"])
+    variable = discrepancy.variable if discrepancy.window is None else str(discrepancy.window["axis"])
     abscissa = EVERY_VARIABLE.get(variable, Variable("rad", 0.0, 0.0, "", f"phase of the wave, {variable}", "rad"))
     label = f"{abscissa.label} [{abscissa.unit_shown}]".removesuffix(" []")
     fig, ((axes,),) = new_figure(1, 1, 3.4)
     axes.axhline(0, color=FAINT, lw=0.8)
-    if found.over is not None and found.defect is not None and found.defect_sd is not None:
-        axes.errorbar(found.over / abscissa.shown, found.defect, 2 * found.defect_sd, fmt="o", ms=4, color=ORANGE,
-                      lw=0.7, label="each run, ±2 sd")  # fmt: skip
-    if found.window is not None:
-        first, last = (float(found.window[end]) / abscissa.shown for end in ("low", "high"))
+    if discrepancy.over is not None and discrepancy.defect is not None and discrepancy.defect_sd is not None:
+        axes.errorbar(discrepancy.over / abscissa.shown, discrepancy.defect, 2 * discrepancy.defect_sd, fmt="o", ms=4,
+                      color=ORANGE, lw=0.7, label="each run, ±2 sd")  # fmt: skip
+    if discrepancy.window is not None:
+        first, last = (float(discrepancy.window[end]) / abscissa.shown for end in ("low", "high"))
         axes.axvspan(first, last, color="#eeeeee", lw=0, zorder=0)
-    x, half = found.at / abscissa.shown, 1.96 * found.sd
-    axes.fill_between(x, found.value - half, found.value + half, color="#cfe3f2", lw=0, label="95 %")
-    axes.plot(x, found.value, color=GREEN, label="smooth curve")
-    axes.set(xlabel=label, ylabel=f"missing in the {place_in_words(found.place)} [{found.unit}]")
+    x, half = discrepancy.at / abscissa.shown, 1.96 * discrepancy.sd
+    axes.fill_between(x, discrepancy.value - half, discrepancy.value + half, color="#cfe3f2", lw=0, label="95 %")
+    axes.plot(x, discrepancy.value, color=GREEN, label="smooth curve")
+    axes.set(xlabel=label, ylabel=f"missing in the {place_in_words(discrepancy.place)} [{discrepancy.unit}]")
     axes.legend(loc="best")
     return fig
