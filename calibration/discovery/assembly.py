@@ -35,32 +35,33 @@ from mmrjax.model import channels, params
 def assemble_result(inputs: loop_input.LoopInput, traced: verdict.LoopStages) -> result.DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, settings, numbers, run = inputs.runs, inputs.settings, inputs.numbers, traced.run
-    screened, left, alike, where = traced.screened, traced.left, traced.alike, traced.where
+    screened, base_diagnosis, alike, where = traced.screened, traced.left, traced.alike, traced.where
     table, nameless = screened.base.space, traced.verdict in WITHOUT_NAME
     # The fits without and with the proposal. For a log, those of its simulation.
     space, base, best, predicted = table, screened.base.candidate, traced.best, traced.predicted
-    noise, before, after, is_added = traced.sds.noise, left, traced.ends, best is not base
+    noise, before, after, is_added = traced.sds.noise, base_diagnosis, traced.ends, best is not base
     if run is not None:
         noise = noise if table.bare.observe.reads else inputs.noise
         space, base, best, predicted = run.space, run.base, run.best if is_added else run.base, {}
-        before, after = run.diagnosis(base, left), run.diagnosis(best, after)
+        before, after = run.diagnosis(base, base_diagnosis), run.diagnosis(best, after)
     observe, included = space.bare.observe, space.included[: len(runs)]
     kind, kinds = type(observe), blocks_room.predictable_blocks(runs, space.bare)
     refit_problem, proposal_problem = prediction.FittedProblem(*space.fit_of(base.active, base.z)), None
-    known_first, known_last = (predicted.get(prediction.candidate_key(c)) for c in (base, best))
+    predicted_by_refit, predicted_by_proposal = (predicted.get(prediction.candidate_key(c)) for c in (base, best))
     curve, z, sd, cost, claimed_cost = None, best.z, best.sd, best.cost, traced.best.cost
-    beside = traced.beside if nameless and run is None else None
-    if beside is not None:
+    base_curve = traced.beside if nameless and run is None else None
+    if base_curve is not None:
         inputs.progress(fit_notes.progress_remark("shape"))
     if is_added:
         proposal_problem = prediction.FittedProblem(*space.fit_of(best.active, best.z))
-    elif beside is not None:  # no effect is added, but a curve
-        curve, after = beside.fitted, beside.diagnosis
+    elif base_curve is not None:  # no effect is added, but a curve
+        curve, after = base_curve.fitted, base_curve.diagnosis
         z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
-        proposal_problem, known_last, claimed_cost = prediction.FittedProblem(curve.problem, z, None), None, cost
+        proposal_problem, predicted_by_proposal = prediction.FittedProblem(curve.problem, z, None), None
+        claimed_cost = cost
     inputs.progress(fit_notes.progress_remark("errors"))
     readings = prediction.readings_of_rows(
-        runs, noise.sd, kinds, refit_problem, proposal_problem, known_first, known_last
+        runs, noise.sd, kinds, refit_problem, proposal_problem, predicted_by_refit, predicted_by_proposal
     )
     gains = _hold_out_gains(space, runs, predicted, traced.best.effects, readings)
     gain = gains[-1][1] if gains and proposal_problem is not None else None
@@ -76,19 +77,21 @@ def assemble_result(inputs: loop_input.LoopInput, traced: verdict.LoopStages) ->
     # What the loop claims: effects or an unnamed discrepancy, and what may be present in addition or instead.
     claimed = dataclasses.replace(best, cost=traced.best.cost)
     effects = (
-        () if alike is None else findings.found_effects(table, screened.base.candidate, claimed, alike, left.test)
+        ()
+        if alike is None
+        else findings.found_effects(table, screened.base.candidate, claimed, alike, base_diagnosis.test)
     )
     hidden: tuple[findings.HiddenEffect, ...] = ()
     if alike is not None and not nameless and run is None:
         named = tuple(itertools.chain(*alike.members))
-        hidden = findings.find_hidden_effects(table, named, left.scores, traced.ends.scores)
+        hidden = findings.find_hidden_effects(table, named, base_diagnosis.scores, traced.ends.scores)
     unnamed = None
     if nameless and traced.beside is not None and where is not None:
-        p_value, simulated = left.test.p_value, run is not None
+        p_value, simulated = base_diagnosis.test.p_value, run is not None
         unnamed = findings.unnamed_discrepancy(traced.beside, where, p_value, len(runs), simulated)
     ladder = () if traced.searched is None else (alike or traced.searched).ladder
     plausible, implausible = findings.listed_alternatives(table, traced.best, claimed_cost, ladder)
-    scores, both_ways = findings.effect_scores(table, left.scores), goes_both_ways(runs)
+    scores, both_ways = findings.effect_scores(table, base_diagnosis.scores), goes_both_ways(runs)
     summary, library = verdict.verdict_summary(traced, numbers), sorted(inputs.library.items())
     remaining = candidates.residuals_by_channel(space, runs, after.linear, readings.after, z)
     with np.errstate(invalid="ignore"):
@@ -114,7 +117,7 @@ def assemble_result(inputs: loop_input.LoopInput, traced: verdict.LoopStages) ->
         unnamed=unnamed,
         remains=None if nameless or alike is None else where,
         next_experiment=_next_experiment(table, traced),
-        cannot_see=findings.invisible_effects(table, left.scores, scores),
+        cannot_see=findings.invisible_effects(table, base_diagnosis.scores, scores),
         needs_histories=tuple(name for name, e in library if e.transient and not kind.shows(e)),
         needs_reverse=tuple(name for name, e in library if e.needs_reverse and not both_ways),
         alternatives=plausible,
@@ -123,7 +126,7 @@ def assemble_result(inputs: loop_input.LoopInput, traced: verdict.LoopStages) ->
         support=summary.support,
         cluster=screened.cluster,
         residual_clusters=find_residual_clusters(remaining, settings.seed),
-        before=left.test,
+        before=base_diagnosis.test,
         after=after.test,
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
@@ -142,7 +145,7 @@ def assemble_result(inputs: loop_input.LoopInput, traced: verdict.LoopStages) ->
             if noise.source[k] != "no readings"
         },
         settings=settings,
-        replicates=len(left.test.null.single),
+        replicates=len(base_diagnosis.test.null.single),
     )
     return dataclasses.replace(assembled, remarks=result_remarks.loop_remarks(assembled, traced, noise, remaining))
 

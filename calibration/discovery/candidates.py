@@ -70,7 +70,7 @@ def _dissipated_power(observe: Observer, robot: Robot) -> Float[Array, "balances
     signals = observe.operating_points(robot)
     if signals is None:
         return None
-    power = jax.vmap(lambda run, at: sink_powers(robot, run, at))(observe.conditions, signals)
+    power = jax.vmap(lambda run, point: sink_powers(robot, run, point))(observe.conditions, signals)
     return jnp.stack([jnp.asarray(power[name], float) for name in SINK.values()])
 
 
@@ -350,8 +350,8 @@ def excess_misfit(space: CandidateSpace, base: Candidate) -> float:
 
     def whitened() -> np.ndarray:  # residuals divided by their sds, 0 for excluded readings
         data = space.equipped.data
-        off = (simulated_reading(space, base) - np.asarray(data.measured)) / np.asarray(data.sd)
-        return np.where(counts, np.nan_to_num(off), 0.0)
+        errors = (simulated_reading(space, base) - np.asarray(data.measured)) / np.asarray(data.sd)
+        return np.where(counts, np.nan_to_num(errors), 0.0)
 
     return 2 * base.cost - space.bare.observe.noise_misfit(whitened, counts)
 

@@ -160,11 +160,11 @@ def find_classes(base_curve: BaseCurve, best: Candidate, ladder: tuple[Candidate
         base_curve: the base fit with its diagnosis.
         after: diagnosis of the best fit.
     """
-    space, left, settings = base_curve.space, base_curve.left, base_curve.settings
+    space, base_diagnosis, settings = base_curve.space, base_curve.left, base_curve.settings
     names, effect_of = space.library.names, space.library.of
     # Largest |cos| between the projected signatures of every two effects, over their shapes.
     cosine = np.zeros((len(names), len(names)))
-    np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(left.scores.cosine))
+    np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(base_diagnosis.scores.cosine))
     is_single = len(best.effects) == 1
     without_each = [base_curve.base] if is_single else refit_without_each(space, best, ladder)
     rivals: dict[tuple[str, str], Names] = {}
@@ -175,7 +175,7 @@ def find_classes(base_curve: BaseCurve, best: Candidate, ladder: tuple[Candidate
                 rivals[name, names[j]] = best.with_effect(name, names[j])
     fits = {c.key: c for c in ladder}
     untried = [active for active in rivals.values() if frozenset(active) - {""} not in fits]
-    fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, left.scores)) for w in untried])
+    fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, base_diagnosis.scores)) for w in untried])
     fits |= {c.key: c for c in fitted}
     members, shift_lists, families = [], [], []
     for name, without in zip(best.effects, without_each, strict=True):
@@ -196,7 +196,7 @@ def find_classes(base_curve: BaseCurve, best: Candidate, ladder: tuple[Candidate
         column = fit.jacobian[: after.linear.readings, space.free + best.active.index(name), None]
         ammeter = ammeter_families(space, remove_effect(space, best, name, fit), column, family, settings)
         families.append(tuple(dict.fromkeys((*(space.library[m].family() for m in equivalent), *ammeter))))
-        shifts = find_prior_shifts(space, without, SURE * gain, left.linear if is_single else None)
+        shifts = find_prior_shifts(space, without, SURE * gain, base_diagnosis.linear if is_single else None)
         shift_lists.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
     return Classes(tuple(members), tuple(shift_lists), tuple(families), (*ladder, *fitted))
 
@@ -226,13 +226,13 @@ def ammeter_families(
         return ()
     names = channels.channel_names(space.bare.channels)
     explained, _ = fit.explained(columns)
-    least = explained - settings.tolerance(explained)
+    needed = explained - settings.tolerance(explained)
     driver = family.partition(" that ")[2].replace("with load", "with current")
     of_channel = np.arange(len(columns)) % len(names)
     return tuple(
         f"{place_in_words(name)} that {driver}"
         for k, name in enumerate(names)
-        if name.endswith("current") and fit.explained(columns * (of_channel == k)[:, None])[0] >= least
+        if name.endswith("current") and fit.explained(columns * (of_channel == k)[:, None])[0] >= needed
     )
 
 

@@ -55,18 +55,18 @@ PARALLEL = 0.98
 # --- location -------------------------------------------------------------------------------------------
 
 
-def locate_discrepancy(left: Diagnosis, bases: bases_room.Bases, included: np.ndarray) -> DiscrepancyLocation:
+def locate_discrepancy(diagnosis: Diagnosis, bases: bases_room.Bases, included: np.ndarray) -> DiscrepancyLocation:
     """Location of a discrepancy: its balance or channel, its variable, and the places that explain the data as well.
 
     The place is that of the most significant smooth curve. The variable is that of the curve with most evidence
     there.
 
     Args:
-        left: diagnosis of a fit.
+        diagnosis: diagnosis of a fit.
         included: True for included rows, shape (rows,).
     """
     names = bases_room.family_names(bases)
-    deviate, explained = np.asarray(left.scores.curve), np.asarray(left.scores.explained)
+    deviate, explained = np.asarray(diagnosis.scores.curve), np.asarray(diagnosis.scores.explained)
     is_window = np.array([bases_room.window_from_name(n[1]) is not None for n in names])
     # A smooth curve responds to a temporary change too, and a window to a smooth curve.
     is_temporary = bool(np.max(deviate[is_window], initial=-np.inf) > np.max(deviate[~is_window]) + ALIKE)
@@ -84,15 +84,17 @@ def locate_discrepancy(left: Diagnosis, bases: bases_room.Bases, included: np.nd
         curves = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
         # A voltage acts on torques and slip only through currents and speeds, so it may be listed but never leads.
         direct = [i for i in curves if place not in MECHANICAL or names[i][1] != "voltage"]
-        evidence = {i: smooth.fit_smooth_curve(left.linear, *names[i], included).evidence for i in direct or curves}
+        evidence = {
+            i: smooth.fit_smooth_curve(diagnosis.linear, *names[i], included).evidence for i in direct or curves
+        }
         j = max(evidence, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in same_kind)
     best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
     variable, strength = names[j][1], float(explained[j])
-    alike = _places_of_same_response(left.linear, [b for b, score in best.items() if score > deviate[k] - ALIKE])
+    alike = _places_of_same_response(diagnosis.linear, [b for b, score in best.items() if score > deviate[k] - ALIKE])
     window = bases_room.window_from_name(variable)
     if window is not None and window.axis in bases_room.AXES:
-        window, strength = refine_window(left.linear, place, window.axis, included)
+        window, strength = refine_window(diagnosis.linear, place, window.axis, included)
         variable = str(window)
     strongest = max(strength, float(explained[k]))
     similar = similar_variables(names, deviate, place, variable)

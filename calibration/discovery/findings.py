@@ -490,10 +490,10 @@ class EffectRanking:
         return [e for e in self.effects if e.score > self.chance and not e.supplies]
 
 
-def rank_library(space: CandidateSpace, left: adequacy.Diagnosis) -> EffectRanking:
+def rank_library(space: CandidateSpace, diagnosis: adequacy.Diagnosis) -> EffectRanking:
     """Ranking of the library by the share of the base's misfit that each effect alone would explain."""
-    test = left.test
-    ranking = _rank_effects(space, left.scores)
+    test = diagnosis.test
+    ranking = _rank_effects(space, diagnosis.scores)
     return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, ranking)
 
 

@@ -155,12 +155,8 @@ def _rows_in_range(base_curve: BaseCurve, masks: Sequence[np.ndarray]) -> np.nda
     Args:
         masks: mask of the rows of each block.
     """
-    included, location, linear, rows = (
-        base_curve.space.included,
-        base_curve.where,
-        base_curve.left.linear,
-        len(masks[0]),
-    )
+    included, location, linear = base_curve.space.included, base_curve.where, base_curve.left.linear
+    rows = len(masks[0])
     in_range = np.ones(rows, bool)
     if location.variable not in bases_room.VARIABLES:
         return in_range
@@ -184,5 +180,5 @@ def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, aft
     sd, counts = np.asarray(space.bare.data.sd)[:rows], space.weight[:rows] > 0
     reading_changes = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)
     reading_changes = np.nan_to_num(reading_changes)
-    most = np.max(np.sqrt(np.sum(reading_changes**2, 0) / np.maximum(counts.sum(0), 1)))
-    return np.asarray(counts & (reading_changes >= CHANGED * most))
+    largest_change = np.max(np.sqrt(np.sum(reading_changes**2, 0) / np.maximum(counts.sum(0), 1)))
+    return np.asarray(counts & (reading_changes >= CHANGED * largest_change))

@@ -131,14 +131,14 @@ def confirm_readings(
         return traced
     confirmed = traced.left.test.confirmed(max(0.0, 2 * (simulation.base.cost - simulation.best.cost)))
     if not confirmed.rejected and traced.screened.cluster is None:
-        left = dataclasses.replace(traced.left, test=confirmed)
+        base_diagnosis = dataclasses.replace(traced.left, test=confirmed)
         without_effects = dataclasses.replace(simulation, best=simulation.base, promised=0.0, gained=0.0)
-        return LoopStages("none", traced.screened, left, traced.sds, run=without_effects)
+        return LoopStages("none", traced.screened, base_diagnosis, traced.sds, run=without_effects)
     return _lower_if_contradicted(readings, traced)
 
 
 def smallest_confirmed(
-    space: active_set.CandidateSpace, screened: Screening, left: Diagnosis,
+    space: active_set.CandidateSpace, screened: Screening, base_diagnosis: Diagnosis,
     searched: SearchResult, noise: Noise,
 ) -> SearchResult:  # fmt: skip
     """The search with the smallest set whose simulation leaves no discrepancy, or else the largest set.
@@ -150,7 +150,7 @@ def smallest_confirmed(
 
     Args:
         space: space of the simulated log. If it has room for effects, only sets of these are simulated.
-        screened, left, searched: linear fit of the base, its diagnosis, and the search from it.
+        screened, base_diagnosis, searched: linear fit of the base, its diagnosis, and the search from it.
         noise: noise of the readings.
     """
     best = searched.best
@@ -166,7 +166,7 @@ def smallest_confirmed(
     for sets in filter(None, sets_by_size):
         fits = [refine_by_simulation(space, c, [c.z]) for c in sets]
         k = min(range(len(fits)), key=lambda k: fits[k].cost)
-        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left, left.linear)
+        diagnosis = diagnose_candidate(space, fits[k], screened.bases, base_diagnosis, base_diagnosis.linear)
         searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
         if not diagnosis.test.rejected_with_margin:
             break
@@ -179,7 +179,7 @@ def _has_room(space: active_set.CandidateSpace, fit: Candidate) -> bool:
 
 
 def best_simulated_size(
-    space: active_set.CandidateSpace, screened: Screening, left: Diagnosis,
+    space: active_set.CandidateSpace, screened: Screening, base_diagnosis: Diagnosis,
     searched: SearchResult, noise: Noise,
 ) -> SearchResult:  # fmt: skip
     """The search in the windows of a log with the largest set that lowers the misfit of a simulation.
@@ -197,7 +197,7 @@ def best_simulated_size(
     best = sets[int(np.argmin(costs))]
     if best is searched.best:
         return searched
-    diagnosis = diagnose_candidate(screened.base.space, best, screened.bases, left)
+    diagnosis = diagnose_candidate(screened.base.space, best, screened.bases, base_diagnosis)
     return dataclasses.replace(searched, best=best, diagnosis=diagnosis)
 
 
@@ -252,12 +252,13 @@ def confirm_windows(log_input: LoopInput, windows: LoopInput, traced: LoopStages
     gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
     level. No effect is named if the simulation misses a channel.
     """
-    screened, left, searched, base_curve = traced.screened, traced.left, traced.searched, traced.beside
+    screened, base_diagnosis, searched, base_curve = traced.screened, traced.left, traced.searched, traced.beside
 
     def undescribed(channels_missed: tuple[MissedChannel, ...]) -> LoopStages:
         return dataclasses.replace(
-            LoopStages("undescribed", screened, left, traced.sds, searched), beside=base_curve, run=traced.run,
-            predicted=traced.predicted, missed=channels_missed, unused=verdict.unused_inputs(log_input.runs),
+            LoopStages("undescribed", screened, base_diagnosis, traced.sds, searched), beside=base_curve,
+            run=traced.run, predicted=traced.predicted,
+            missed=channels_missed, unused=verdict.unused_inputs(log_input.runs),
         )  # fmt: skip
 
     if log_input.known is not None:  # only the noise differs
@@ -271,7 +272,7 @@ def confirm_windows(log_input: LoopInput, windows: LoopInput, traced: LoopStages
     window_fit, base = _chosen_fit(traced), delayed_by_rows(log_input, screened.base.candidate)
     best = base if window_fit is screened.base.candidate else delayed_by_rows(log_input, window_fit)
     simulation = simulate_models(log_input.space.with_room(searched.room), base, best, disturbed=True)
-    confirmed = left.test.confirmed(max(0.0, 2 * (simulation.base.cost - simulation.best.cost)))
+    confirmed = base_diagnosis.test.confirmed(max(0.0, 2 * (simulation.base.cost - simulation.best.cost)))
     chance_misfit = CHANCE * math.sqrt(2 * float(np.sum(simulation.space.weight > 0)))
     if not confirmed.rejected or (
         not simulation.disturbed and excess_misfit(simulation.space, simulation.base) < chance_misfit
@@ -284,8 +285,10 @@ def confirm_windows(log_input: LoopInput, windows: LoopInput, traced: LoopStages
             simulation.space,
             log_input.runs,
             log_input.noise,
-            simulation.diagnosis(x, left).linear,
+            simulation.diagnosis(x, base_diagnosis).linear,
         )
         for x in (simulation.base, simulation.best)
     )
-    return undescribed(channels_missed_by_base()) if channels_missed() else _lower_if_contradicted(windows, traced)
+    if channels_missed():
+        return undescribed(channels_missed_by_base())
+    return _lower_if_contradicted(windows, traced)

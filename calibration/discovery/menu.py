@@ -243,8 +243,8 @@ class _Instrument:
     channel: str
     signals: Names
 
-    def __call__(self, robot: Robot, at: Array) -> Array:
-        signals = [Signals(**dict.fromkeys(self.signals, x)) for (x,) in at]
+    def __call__(self, robot: Robot, settings: Array) -> Array:
+        signals = [Signals(**dict.fromkeys(self.signals, x)) for (x,) in settings]
         return jnp.stack([jnp.asarray(balances.sensor(robot, s)[self.channel]) for s in signals])
 
 
@@ -333,8 +333,8 @@ def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
     """Four voltages that the table lacks: one below its range, one above it if the motors allow, and others in the
     widest gaps.
     """
-    ends = [round_significant(0.55 * used[0]), *[floor_significant(reach.voltage)] * (reach.voltage > used[-1])]
-    return _in_widest_gaps([0.55 * used[0], *used] if len(used) == 1 else used, ends, 4)
+    outer = [round_significant(0.55 * used[0]), *[floor_significant(reach.voltage)] * (reach.voltage > used[-1])]
+    return _in_widest_gaps([0.55 * used[0], *used] if len(used) == 1 else used, outer, 4)
 
 
 def _travel_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:

@@ -178,13 +178,13 @@ def compile_ahead(space: CandidateSpace, runs: Runs) -> Iterator[Callable[[BaseF
     mean = Candidate(empty_slots, zeros, zeros, np.inf, zeros, zeros, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
 
-    is_diagnosed = threading.Event()
+    diagnosed = threading.Event()
 
     def compile_diagnosis() -> None:
         try:
             bases, (linear, _, _) = _diagnose_base(start, runs, space.settings)
         finally:
-            is_diagnosed.set()
+            diagnosed.set()
         if not space.bare.observe.long:
             bootstrap_statistics(
                 space.bare, zeros[: space.free], linear, space.library.scored, bases, 1, space.settings.seed
@@ -193,7 +193,7 @@ def compile_ahead(space: CandidateSpace, runs: Runs) -> Iterator[Callable[[BaseF
     def compile_fit() -> None:
         if space.bare.observe.long:  # its readings are linear from here
             return
-        is_diagnosed.wait()  # needed last: compilation shares two cores with the base fit
+        diagnosed.wait()  # needed last: compilation shares two cores with the base fit
         fit_from_each_start(space.equipped, [zeros], [space.weight], [space.coordinates.indices(empty_slots)])
 
     def compile_predictions(base: BaseFit) -> None:
@@ -242,22 +242,22 @@ def _common_property(screening: Screening, runs: Runs, settings: Settings) -> Ou
     return find_cluster(outliers, included[rows], axes, levels, settings.outlier_error, settings.seed)
 
 
-def screen_with_effects(screening: Screening, left: ScoreTable, runs: Runs, settings: Settings) -> Screening | None:
+def screen_with_effects(screening: Screening, scores: ScoreTable, runs: Runs, settings: Settings) -> Screening | None:
     """Excludes rows that are outliers only after effects are added.
 
     None if there are no such rows, or if they form a cluster.
 
     Args:
-        left: scores of the residuals of the fit with effects.
+        scores: scores of the residuals of the fit with effects.
     """
     row_count = screening.base.space.included.sum() + len(screening.outliers)
     allowed = settings.outliers(int(row_count)) - len(screening.outliers)
-    isolated = _isolated_rows(screening.base, left, screening.bases, allowed, settings)
+    isolated = _isolated_rows(screening.base, scores, screening.bases, allowed, settings)
     if not isolated.size or screening.cluster is not None:
         return None
     base = _refit_without(screening.base, isolated, settings, runs.source)
-    more = Screening(base, (*screening.outliers, *map(int, isolated)), *_diagnose_base(base, runs, settings))
-    return more if _common_property(more, runs, settings) is None else None
+    extended = Screening(base, (*screening.outliers, *map(int, isolated)), *_diagnose_base(base, runs, settings))
+    return extended if _common_property(extended, runs, settings) is None else None
 
 
 def _isolated_rows(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:
@@ -281,8 +281,8 @@ def _diagnose_base(base: BaseFit, runs: Runs, settings: Settings) -> tuple[Bases
 
 
 def _refit_without(base: BaseFit, rows: np.ndarray, settings: Settings, source: str) -> BaseFit:
-    again = fit_base(base.space.without(rows), source, base.candidate)
-    return dataclasses.replace(again, unusable=tuple(sorted({*base.unusable, *again.unusable})))
+    refit = fit_base(base.space.without(rows), source, base.candidate)
+    return dataclasses.replace(refit, unusable=tuple(sorted({*base.unusable, *refit.unusable})))
 
 
 def _exclude_gross_errors(base: BaseFit, settings: Settings, source: str) -> tuple[BaseFit, tuple[int, ...]]:

@@ -89,11 +89,11 @@ class Gain:
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
-def _clustered_standard_error(off: np.ndarray, groups: np.ndarray) -> float:
+def _clustered_standard_error(terms: np.ndarray, groups: np.ndarray) -> float:
     """Standard error of a sum whose terms are correlated within groups."""
     _, cluster_index = np.unique(groups, return_inverse=True)
     count = cluster_index.max() + 1
-    sums = np.bincount(cluster_index, off)
+    sums = np.bincount(cluster_index, terms)
     return float(np.sqrt(np.sum(sums**2) * count / (count - 1))) if count > 1 else 0.0
 
 

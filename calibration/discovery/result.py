@@ -197,8 +197,8 @@ class DiscoveryResult:
         Unlike `chi2`, it excludes the distances of parameters from their priors, and penalties.
         """
         readings = self.readings_of_rows
-        off = [(x - readings.measured) / readings.sd for x in (readings.before, readings.after)]
-        before, after = (float(np.nansum(x[self.included] ** 2)) for x in off)
+        residuals = [(x - readings.measured) / readings.sd for x in (readings.before, readings.after)]
+        before, after = (float(np.nansum(x[self.included] ** 2)) for x in residuals)
         return before, after
 
     @property
@@ -313,8 +313,8 @@ class DiscoveryResult:
         held out), and errors of balances if known.
         """
         readings = self.readings_of_rows
-        known_columns = ("run_id", *columns.WHEN, "configuration", *self.runs.axes, *columns.DRIVING)
-        table = {"row": self.numbers, **{k: self.runs[k] for k in known_columns if self.runs.has(k)}}
+        condition_columns = ("run_id", *columns.WHEN, "configuration", *self.runs.axes, *columns.DRIVING)
+        table = {"row": self.numbers, **{k: self.runs[k] for k in condition_columns if self.runs.has(k)}}
         main = next(iter(readings.held_out.values()), None)
         for k, channel in enumerate(self.channels):
             column, unit = channel.column, channel.factor
@@ -324,8 +324,8 @@ class DiscoveryResult:
                 columns_of_channel |= {f"held_out_before_{column}": main[0], f"held_out_after_{column}": main[1]}
             table |= {name: x[:, k] / unit for name, x in columns_of_channel.items()}
             for when, simulated in (("before", readings.before), ("after", readings.after)):
-                off = simulated[:, k] - readings.measured[:, k]
-                table[f"residual_{when}_{channel.name}_sigma"] = off / readings.sd[:, k]
+                errors = simulated[:, k] - readings.measured[:, k]
+                table[f"residual_{when}_{channel.name}_sigma"] = errors / readings.sd[:, k]
         table |= self.detail.columns()
         use = np.full(len(self.runs), "used", dtype="<U8")
         use[np.isin(self.numbers, self.outliers)] = "outlier"

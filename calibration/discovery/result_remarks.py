@@ -157,8 +157,8 @@ def neighbouring_levels(x: np.ndarray, run_level: float) -> tuple[float, ...]:
         x: levels of the series.
         run_level: level of the run.
     """
-    apart = np.abs(x - run_level)
-    other_levels = apart[apart > LEVEL * np.ptp(x)]
+    distances = np.abs(x - run_level)
+    other_levels = distances[distances > LEVEL * np.ptp(x)]
     if not other_levels.size:
         return ()
     unit = 10.0 ** math.floor(math.log10(other_levels.min() / 2))

@@ -73,7 +73,7 @@ def diagnose_candidate(
 def search_effects(
     space: CandidateSpace,
     base: Candidate,
-    left: Diagnosis,
+    base_diagnosis: Diagnosis,
     bases: Bases,
     progress: Callable[[Remark], None],
 ) -> SearchResult:
@@ -81,23 +81,25 @@ def search_effects(
 
     Args:
         base: fit without effects.
-        left: diagnosis of that fit.
+        base_diagnosis: diagnosis of that fit.
     """
-    names = _names_by_score(space, left.scores)[: space.bare.observe.policy.batch]
-    ladder = fit_in_addition(space, [(fill_slots([name], space.settings), base, left.scores) for name in names])
-    null = np.asarray(left.test.null.single)
+    names = _names_by_score(space, base_diagnosis.scores)[: space.bare.observe.policy.batch]
+    ladder = fit_in_addition(
+        space, [(fill_slots([name], space.settings), base, base_diagnosis.scores) for name in names]
+    )
+    null = np.asarray(base_diagnosis.test.null.single)
     best, diagnosis, diagnosed = _best_plausible(ladder), None, None
     if best is not None and single_p_value(2 * (base.cost - best.cost), null) > space.settings.family_wise_error:
         best = None
     while best is not None:
         diagnosed = best
-        diagnosis = diagnose_candidate(space, best, bases, left)
+        diagnosis = diagnose_candidate(space, best, bases, base_diagnosis)
         if not diagnosis.test.rejected_with_margin or len(best.effects) == int(
             min(space.settings.slots, max(1, space.included.sum() // space.settings.rows_per_effect))
         ):
             break
         progress(progress_remark("more effects", best.effects))
-        extensions = _extend_set(space, best, diagnosis, base, left)
+        extensions = _extend_set(space, best, diagnosis, base, base_diagnosis)
         # It has to explain clearly more than every candidate with one effect fewer.
         fewer_costs = [c.cost for c in ladder if c.plausible and len(c.effects) == len(best.effects)]
         best = _best_plausible(extensions)
@@ -157,22 +159,22 @@ def _names_by_score(space: CandidateSpace, scores: ScoreTable, last: Sequence[st
 def _extend_set(
     space: CandidateSpace,
     best: Candidate,
-    left_by_best: Diagnosis,
+    best_diagnosis: Diagnosis,
     base: Candidate,
-    left: Diagnosis,
+    base_diagnosis: Diagnosis,
 ) -> list[Candidate]:
     """Fits the best set with one more effect and, if the best is the base, also pairs of effects."""
     batch = space.bare.observe.policy.batch
-    names = _names_by_score(space, left_by_best.scores, best.effects)[:batch]
-    sources = {fill_slots([*best.effects, name], space.settings): (best, left_by_best) for name in names}
+    names = _names_by_score(space, best_diagnosis.scores, best.effects)[:batch]
+    sources = {fill_slots([*best.effects, name], space.settings): (best, best_diagnosis) for name in names}
     if len(best.effects) == 1:
-        pair_scores = np.triu(left.scores.pair)
+        pair_scores = np.triu(base_diagnosis.scores.pair)
         strongest = np.unravel_index(np.argsort(-pair_scores, axis=None)[:PAIRS], pair_scores.shape)
         pairs = dict.fromkeys(tuple(sorted(pair)) for pair in space.library.of[np.stack(strongest, 1)].tolist())
         for i, j in itertools.islice((pair for pair in pairs if pair[0] != pair[1]), batch):
             pair = space.library.names[i], space.library.names[j]
             if not {fill_slots(pair, space.settings), fill_slots(pair[::-1], space.settings)} & sources.keys():
-                sources[fill_slots(pair, space.settings)] = base, left
+                sources[fill_slots(pair, space.settings)] = base, base_diagnosis
     extensions = [(active, fit, ranking.scores) for active, (fit, ranking) in sources.items()]
     return fit_in_addition(space, extensions)
 

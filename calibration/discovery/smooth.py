@@ -117,10 +117,8 @@ def fit_smooth_curve(linear: Linearization, balance: str, variable: str, include
         evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(information)[1]
         if evidence > best[0]:
             covariance = np.linalg.inv(information)
-            explained, freedom = (
-                float(2 * pull @ z - z @ prior_information @ z),
-                float(np.trace(covariance @ prior_information)),
-            )
+            explained = float(2 * pull @ z - z @ prior_information @ z)
+            freedom = float(np.trace(covariance @ prior_information))
             best = evidence, (scale, root, z, covariance, explained, freedom, 2 * float(evidence))
     return SmoothCurve(f"curve_{balance}_{axis}", variable, low, high, *best[1])
 

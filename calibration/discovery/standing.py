@@ -86,13 +86,13 @@ def judge_names(
 
 def _better_but_implausible(base_curve: BaseCurve, best: Candidate, ladder: Sequence[Candidate]) -> list[Candidate]:
     """Candidates with more evidence that only their size excludes, the best first."""
-    least = evidence_of_names(base_curve.space, base_curve.base, best) + base_curve.settings.preferred
+    needed = evidence_of_names(base_curve.space, base_curve.base, best) + base_curve.settings.preferred
     evidence = {
         c.active: (evidence_of_names(base_curve.space, base_curve.base, c), c)
         for c in ladder
         if c.simulated and np.isfinite(c.cost) and len(c.effects) <= len(best.effects) and not c.plausible
     }
-    better = [(e, c) for e, c in evidence.values() if e > least]
+    better = [(e, c) for e, c in evidence.values() if e > needed]
     return [c for _, c in sorted(better, key=lambda pair: -pair[0])]
 
 
@@ -195,15 +195,15 @@ def _equation_of_effect(space: CandidateSpace, effect: str) -> str:
 
 def _compare_with_single_curve(base_curve: BaseCurve, best: Candidate) -> NameSupport:
     """Tests if a single smooth curve fits the data where the effects of a candidate do not."""
-    left, bases = base_curve.left, base_curve.bases
+    base_diagnosis, bases = base_curve.left, base_curve.bases
     names = bases_room.family_names(bases)
     strongest: dict[str, int] = {}  # family of each place, the most significant place first
-    for index in np.argsort(-np.asarray(left.scores.curve)):
+    for index in np.argsort(-np.asarray(base_diagnosis.scores.curve)):
         strongest.setdefault(names[index][0], int(index))
     for place, k in itertools.islice(strongest.items(), ALONE):
-        columns = family_columns(left.linear, bases, k)
-        statistics, _ = statistics_with_columns(left.linear, bases, columns, [place])
-        if not left.test.of(statistics).rejected_with_margin:
+        columns = family_columns(base_diagnosis.linear, bases, k)
+        statistics, _ = statistics_with_columns(base_diagnosis.linear, bases, columns, [place])
+        if not base_diagnosis.test.of(statistics).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(PlacedCurve(place, names[k][1:]),))
     location, space = base_curve.where, base_curve.space
     equations = {_equation_of_effect(space, effect) for effect in best.effects}
@@ -211,7 +211,7 @@ def _compare_with_single_curve(base_curve: BaseCurve, best: Candidate) -> NameSu
     if not space.bare.observe.over_time and equation_of_place(location.place) in equations:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
-        adequate = not left.test.exceeds_margin("chi2", base_curve.fitted.chi2[1])
+        adequate = not base_diagnosis.test.exceeds_margin("chi2", base_curve.fitted.chi2[1])
         if adequate and not base_curve.diagnosis.test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(PlacedCurve(location.place, (location.variable,)),))
     return NameSupport(True)
@@ -336,8 +336,8 @@ def _largest_variation(
 ) -> tuple[float, str, float, float]:
     """Largest change of an effect's amplitude over a variable, as a line or a parabola.
 
-    Returns the root of its score after a refit [σ], the variable, the critical value [σ], and the relative change
-    of the amplitude at an end of the variable's range [-]. The critical value holds for all these tests
+    Returns four values: root of its score after a refit [σ], variable, critical value [σ], and relative change of
+    the amplitude at an end of the variable's range [-]. The critical value holds for all these tests
     (Bonferroni 1936).
 
     To first order, the residual of a law of another form is the name's own term with an amplitude that varies. So

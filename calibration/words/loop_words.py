@@ -77,13 +77,13 @@ def _mechanism_claim(summary: loop_notes.VerdictSummary, where: DiscrepancyLocat
 def _place_claim(summary: loop_notes.VerdictSummary, where: DiscrepancyLocation, evidence: str) -> str:
     """A place with the variable that shows it, and reasons why nothing more is established."""
     others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
-    also = f" (or {', '.join(others)}, which these data cannot distinguish)" if others else ""
-    family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
+    alternatives = f" (or {', '.join(others)}, which these data cannot distinguish)" if others else ""
+    family = f": {where.family}" if where.variable in bases.VARIABLES else ""
     no_effect = "is established" if summary.missing else "explains it"
     no_more = "" if summary.mechanism is None else f" No mechanism is established: {no_mechanism(summary.mechanism)}."
     return (
-        f"Something is missing in the {bases.place_in_words(where.place)}{also}, "
-        f"{_variable_phrase(where)}{family_words}. No effect of the library {no_effect} ({evidence}).{no_more}"
+        f"Something is missing in the {bases.place_in_words(where.place)}{alternatives}, "
+        f"{_variable_phrase(where)}{family}. No effect of the library {no_effect} ({evidence}).{no_more}"
     )
 
 
@@ -254,9 +254,9 @@ def _effect_and_rivals(effect: loop_notes.MissingEffect) -> str:
         return effect.names[0]
     family = f"{effect.families[0]}, " if len(effect.families) == 1 else ""
     names = ", ".join(in_order_of_parts(effect.names))
-    names_words = names if len(effect.names) == 1 else f"one of {names}"
+    choice = names if len(effect.names) == 1 else f"one of {names}"
     values = [freed_value(v) for v in effect.values]
-    return f"{family}{', or '.join([names_words, *values, *readings])} (these data cannot distinguish them)"
+    return f"{family}{', or '.join([choice, *values, *readings])} (these data cannot distinguish them)"
 
 
 def _tentative(summary: loop_notes.VerdictSummary) -> str:
