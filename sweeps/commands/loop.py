@@ -133,8 +133,8 @@ def _run_loop(config: configuration.Loop, options: configuration.LoopBeside, rob
 
 
 @contextlib.contextmanager
-def _time_limit(seconds: float, is_limited: Callable[[], bool]) -> Iterator[None]:
-    """Context manager that raises `OutOfTime` in its block after this many seconds while `is_limited` is true.
+def _time_limit(seconds: float, applies: Callable[[], bool]) -> Iterator[None]:
+    """Context manager that raises `OutOfTime` in its block after this many seconds while `applies` is true.
 
     On some platforms it also interrupts a running step, and repeats this every second, because a called function may
     suppress the exception.
@@ -144,7 +144,7 @@ def _time_limit(seconds: float, is_limited: Callable[[], bool]) -> Iterator[None
         return
 
     def ring(*_: Any) -> None:
-        if is_limited():
+        if applies():
             raise OutOfTime
 
     handler_before = signal.signal(signal.SIGALRM, ring)

@@ -73,8 +73,8 @@ class Chain:
                     f"--model: {source.name}, joint {name} has several actuators; expected one drive per joint"
                 )
         if model.neq or not names:
-            problem_words = "closed loops (<equality>)" if names else "no joint"
-            raise BadConfiguration(f"--model: {source.name} has {problem_words}; expected a chain or tree of hinges")
+            obstacle = "closed loops (<equality>)" if names else "no joint"
+            raise BadConfiguration(f"--model: {source.name} has {obstacle}; expected a chain or tree of hinges")
         self.names: Names = tuple(names)
         self.driven: Names = tuple(names[k] for k in sorted(driven))
         for values in (model.dof_damping, model.dof_frictionloss, model.dof_armature):
