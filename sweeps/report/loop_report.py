@@ -89,8 +89,17 @@ def _run_figures(result: DiscoveryResult, table: Columns, changes: Mapping[str, 
         laws.append(catalogue.figure("loop.law", result, table, name, change, words=law, suffix=name if laws else ""))
     verdict, crosses_zero = "none" if result.refit_alone else result.verdict, Layout.of(result.robot).crosses_zero
     residuals, curve = catalogue.figure("loop.before_after", table, result.channels, verdict), _curve(result)
-    closed = _closed_equations(result, table) if crosses_zero else catalogue.text("loop.three")
-    defects = [catalogue.figure("loop.defects", table, verdict, crosses_zero, words=(closed,))]
+    closure_note = catalogue.text("loop.three")
+    if crosses_zero:
+        from sweeps.pages import loop_figures
+
+        sides = max(1, len(loop_figures.defects_by_side(table, "before", "track")))
+        equations, of_sides = loop_figures.closed_equations(table), " of each side" * (sides > 1)
+        closure_note = catalogue.text("loop.fewer", " of both sides" * (sides > 1))
+        if len(result.channels) >= len(equations) * sides:
+            names = ", ".join(n.replace("electrical", "voltage").replace("track", "torque") for n in equations)
+            closure_note = catalogue.text("loop.closes", count_noun(len(equations), "equation"), of_sides, names)
+    defects = [catalogue.figure("loop.defects", table, verdict, crosses_zero, words=(closure_note,))]
     if drive_curves.lost_by_load(result.robot) and result.robot.rig.imposed == "voltage":
         plane = lambda: drive_curves.drive_plane(result.robot, result.runs)  # noqa: E731
         defects.insert(0, catalogue.figure("run.drive_plane", values=plane))
@@ -278,18 +287,6 @@ def _sections(
     kinds = {"": "measured", "before_": "before", "after_": "after"}
     yield fit_tables.rows_section(table, result.channels, kinds, False, first=first, last={"use": table["use"]})
     yield Section("Words", (catalogue.table("loop.words", list(words.GLOSSARY.items())),))
-
-
-def _closed_equations(result: DiscoveryResult, table: Columns) -> str:
-    """Note on the equations whose errors the channels determine."""
-    from sweeps.pages import loop_figures
-
-    sides = max(1, len(loop_figures.defects_by_side(table, "before", "track")))
-    closed, of_sides = loop_figures.closed_equations(table), " of each side" if sides > 1 else ""
-    if len(result.channels) < len(closed) * sides:
-        return catalogue.text("loop.fewer", " of both sides" if sides > 1 else "")
-    names = ", ".join(n.replace("electrical", "voltage").replace("track", "torque") for n in closed)
-    return catalogue.text("loop.closes", count_noun(len(closed), "equation"), of_sides, names)
 
 
 def _candidates(result: DiscoveryResult) -> Iterable[Block]:
