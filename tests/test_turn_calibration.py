@@ -162,7 +162,7 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     with refused(r"settled runs \(12, .* s in all\) have only 3 operating points. Hold 6 or"):
         rows_to_fit(dataclasses.replace(few, columns=again), robot, 4000)
     short = runs.where(np.arange(len(runs)) % turns.HOLD < 8)
-    with refused(r"the longest level has .*; give one command for straight travel, or hold each"):
+    with refused(r"held too briefly.*; hold it longer, or give one command for straight travel"):
         rows_to_fit(short, robot, 4000)
     table, file = turns.write(tmp_path, "clean", 3, form=turns.log)
     for command in ("loop", "calibrate"):

@@ -226,28 +226,3 @@ def pressure(stance, centre):
     line, weight = np.polynomial.legendre.leggauss(stance.nodes)
     place, share = (line, weight / 2) if stance.on_tracks else (np.array([-1, 1]), 0.5)
     return middle + place * half, share * (1 + tilt * place)
-
-
-def of_configuration(turns, k):
-    motion, size = turns[0], 3 * len(DUTIES) + 1
-    readings = {
-        "motor_current_left": motion.current[:, 0], "motor_current_right": motion.current[:, 1],
-        "motor_speed_left": motion.speed_motor[:, 0], "motor_speed_right": motion.speed_motor[:, 1],
-        "yaw_rate": motion.yaw_rate, "speed": motion.speed, "lateral_speed": motion.speed_lateral,
-    }  # fmt: skip
-    return {name: x[k * size : (k + 1) * size] for name, x in readings.items()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("k", [0, 1], ids=CONFIGURATIONS)
-def test_sides_swapped_mirror_and_both_reversed_reverse(turns, k):
-    mine, n = of_configuration(turns, k), len(DUTIES)
-    same, swapped, back = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
-    pairs = {"motor_current_left": "motor_current_right", "motor_speed_left": "motor_speed_right", "speed": "speed"}
-    for name, other in pairs.items():
-        assert_allclose(mine[name][same], mine[other][swapped], rtol=1e-9, atol=1e-11)
-        assert_allclose(mine[name][same], -mine[name][back], rtol=1e-9, atol=1e-11)
-    for name in ("yaw_rate", "lateral_speed"):
-        assert_allclose(mine[name][same], -mine[name][swapped], rtol=1e-9, atol=1e-11)
-    assert_allclose(mine["yaw_rate"][same], -mine["yaw_rate"][back], rtol=1e-9, atol=1e-11)
-    assert_allclose(mine["lateral_speed"][same], mine["lateral_speed"][back], rtol=1e-9, atol=1e-11)

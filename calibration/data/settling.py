@@ -757,7 +757,10 @@ def _nothing_settled_message(settled: Settled) -> str:
     longest = max(by_reason[why], key=lambda s: s.lasts)
     advice = REASONS[why][1]
     cure = "log driven motion" if advice.startswith("nothing") else advice
-    alternative = "give one command for straight travel" if settled.runs.turns else "use the log itself with loop"
+    if settled.runs.turns:  # found by calibrate and loop, which have no options of settle
+        cure, alternative = cure.partition(", or")[0], "give one command for straight travel"
+    else:
+        alternative = "use the log itself with loop"
     place = settled.runs.place(longest.rows[0], longest.rows[-1])
     return (
         f"{place}: no settled segment: {longest.reason}. This level has {longest.lasts:.3g} s and "
