@@ -130,7 +130,7 @@ def test_what_happens_for_a_while_has_a_window(shown, capsys):
     assert window["low"] >= 25 and window["high"] <= 50 and f"in {runs}" in got.printed
     assert not any("conditions alike" in note for note in got.document["notes"])
     assert "curve" in drawn(got.text) and "order" in got.found.rows_table()
-    assert following["name"] == "the same runs again" and f"{runs} again" in following["description"]
+    assert following["name"] == "the same runs again" and f"Repeat {runs}" in following["description"]
 
 
 def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):

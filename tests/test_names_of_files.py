@@ -363,7 +363,7 @@ OTHERS = {
     "calibrate": ("calibrate", "measured", "--starts", "2", "--no-profiles", "--no-report"),
     "charge": ("sweep", "charge.toml", "--export", "csv", "--no-report"),
     "check": ("check", "few.toml", "--no-report", "--no-changes"),
-    "size": ("size", "few.toml", "--starts", "8", "--motors", "RE 30 24 V", "--no-report"),
+    "size": ("size", "few.toml", "--motors", "RE 30 24 V", "--no-report"),
     "sensitivity": (
         "sensitivity", "--method", "local", "--slopes", "0", "--voltages", "24", "--payloads", "0", "--configurations",
         "6T2A", "--outputs", "total_current,speed,start,steepest_slope", "--no-report",

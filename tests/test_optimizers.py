@@ -79,7 +79,7 @@ class Bent(eqx.Module):
     """An observer of rows with residuals a function of four numbers: curved, and with a penalty beyond a line."""
 
     long: bool = eqx.field(static=True, default=False)
-    apart: bool = eqx.field(static=True, default=False)
+    solves_separately: bool = eqx.field(static=True, default=False)
 
     def solve(self, robot):
         return None

@@ -92,7 +92,7 @@ def test_same_seed_same_members_and_another_seed_others(posed, known, found):
 
 @pytest.mark.slow
 def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
-    rows = jax.tree.map(lambda x: x[:3], found.seen)
+    rows = jax.tree.map(lambda x: x[:3], found.observations)
     for z, cost in zip(found.z[:3], population.member_objective(posed, known)(found.z[:3], rows), strict=True):
         readings = np.asarray(posed.misfit(jnp.asarray(z)))[: posed.data.measured.size]
         lost = np.isin(np.asarray(posed.observation(jnp.asarray(z)).status), (2, 3, 4))
@@ -106,19 +106,19 @@ def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, run
     """n ln s is, but for a constant, ½ Σ (e/σ)² + n ln σ at the σ that makes it smallest."""
     unknown = noise.noise_from_table(runs, SettledRuns.sizes(runs))
     worst = found.order[-2:]  # far above the least share that is taken for noise
-    rows = jax.tree.map(lambda x: x[worst], found.seen)
+    rows = jax.tree.map(lambda x: x[worst], found.observations)
     costs = population.member_objective(posed, unknown)(found.z[worst], rows)
     size, measured = SettledRuns.sizes(runs), np.asarray(posed.data.measured)
 
     def at(k, share):
         """Of each channel, at a share for its noise."""
-        error = (found.seen.reading[k] - measured) / size / share
+        error = (found.observations.reading[k] - measured) / size / share
         return 0.5 * np.sum(error**2, axis=0) + len(size) * np.log(share)
 
     best = [
         np.min([at(k, share) for share in GRID], axis=0).sum()
         + 0.5 * np.sum((found.z[k] - np.asarray(posed.data.centre)) ** 2)
-        + population.LOST * np.isin(found.seen.status[k], (2, 3, 4)).sum()
+        + population.LOST * np.isin(found.observations.status[k], (2, 3, 4)).sum()
         for k in worst
     ]
     assert costs[1] - costs[0] == pytest.approx(best[1] - best[0], abs=0.1)
@@ -129,9 +129,9 @@ GRID = np.geomspace(1.2e-3, 1.0, 80)
 
 @pytest.mark.slow
 def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(posed, known, found):
-    status = found.seen.status[:1].copy()
+    status = found.observations.status[:1].copy()
     status[0, 0] = 2
-    reached = dataclasses.replace(jax.tree.map(lambda x: x[:1], found.seen), status=np.zeros_like(status))
+    reached = dataclasses.replace(jax.tree.map(lambda x: x[:1], found.observations), status=np.zeros_like(status))
     lost = dataclasses.replace(reached, status=status)
     cost = population.member_objective(posed, known)
     assert cost(found.z[:1], lost) - cost(found.z[:1], reached) == pytest.approx(population.LOST)

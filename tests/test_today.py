@@ -110,7 +110,7 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     assert (up.stages.sense, back.stages.sense) == (1.0, -1.0)  # the way back is drawn as the way there
     assert (*up.stages.bounds, up.stages.settled) == pytest.approx((*back.stages.bounds, back.stages.settled))
     flat = api.simulate(robot, api.Conditions(0, 33.0, 0.0), "drive", duration=5.0)
-    assert up.ended[0] > 1.2 * float(flat.total_current)
+    assert up.end_values[0] > 1.2 * float(flat.total_current)
 
 
 @pytest.mark.slow
