@@ -583,4 +583,5 @@ def default_path(command: str) -> Path:
     """`runs/<command>-<time>`, for a command without `--out`."""
     now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     path = Path("runs") / f"{command}-{now}"
-    return path if not path.exists() else path.with_name(f"{path.name}-{os.getpid()}")
+    is_taken = path.exists() or path.with_name(f"{path.name}.partial").exists()
+    return path.with_name(f"{path.name}-{os.getpid()}") if is_taken else path

@@ -12,6 +12,7 @@ from test_weak_form import RIG, motor
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.rig_facts import log_doubts, swapped_sentence
+from calibration.data.row_checks import split_at_jumps
 from calibration.data.runs import Runs, read_runs
 from calibration.data.unused_readings import without_held
 from calibration.described import describe
@@ -106,6 +107,13 @@ def test_an_angle_of_one_turn_keeps_counting(tmp_path, length):
     assert [n for n in again.notes if n not in log.notes] == [
         f"{again.source} row 254, output_angle_deg: wraps at 360 deg. The wraps are removed"
     ]
+
+
+def test_parts_are_numbered_within_each_recording():
+    time = np.concatenate([0.1 * np.arange(60) + 50.0 * (np.arange(60) >= 30)] * 2)
+    runs = Runs("log.csv", {"time_s": time, "run_id": np.repeat(["a", "b"], 60)})
+    parts = split_at_jumps(runs, at_rest=False)["run_id"]
+    assert list(dict.fromkeys(parts)) == ["a", "a part 2", "b", "b part 2"]
 
 
 @pytest.mark.parametrize("step", [7.0, -2.0])

@@ -9,7 +9,7 @@ from worlds.events import Bench
 from calibration.described import describe
 from calibration.discovery import discover, verdict
 from calibration.discovery.loop_input import LoopInput, prepare_loop
-from calibration.discovery.stages import findings, search_until_clean
+from calibration.discovery.stages import findings, outliers, search_until_clean
 from calibration.inference.lost_motion import lost_motion_notes
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
@@ -148,6 +148,24 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
     searched = search_until_clean(task, base, None)[2]
     assert (searched is None) == lost
     assert steps == ["bootstrap 0"] + ["ranking", "search 0"] * (not lost)
+
+
+def test_the_last_search_belongs_to_the_rows_that_are_returned(monkeypatch):
+    """A row excluded after the last search was missing from the fit, but not from its search."""
+    unexplained = SimpleNamespace(scores=None, test=SimpleNamespace(rejected=True, rejected_with_margin=True))
+
+    def keep(name, make):
+        (screened,) = make.args[:1]
+        results = SimpleNamespace(diagnosis=unexplained, screened=screened)
+        return (screened, unexplained) if name.startswith("bootstrap") else (screened, unexplained, results)
+
+    monkeypatch.setattr(outliers, "screen_with_effects", lambda *_: SimpleNamespace(cluster=None))
+    task = SimpleNamespace(
+        settings=SimpleNamespace(replicates=1), keep=keep, ranked=[1], progress=lambda step: None,
+        shows_unmodelled_backlash=False, runs=None,
+    )  # fmt: skip
+    screened, _, searched = search_until_clean(task, SimpleNamespace(cluster=None), None)
+    assert searched.screened is screened
 
 
 @pytest.mark.parametrize("rejected", [True, False])

@@ -202,12 +202,12 @@ def _is_time_without_date(cell: str) -> bool:
 
 
 def _date_seconds(cell: str) -> float:
-    """Seconds of a date and time since a fixed day, NaN for other cells."""
+    """Seconds since 1970 of a date and time, NaN for other cells. A time without date is on `_SOME_DAY`."""
     if ":" not in cell:
         return math.nan
-    dated = _WITH_POINTS.sub(r"\3-\2-\1", cell)
+    iso_text = _WITH_POINTS.sub(r"\3-\2-\1", cell)
     try:
-        when = datetime.datetime.fromisoformat(_SOME_DAY + cell if _is_time_without_date(cell) else dated)
+        when = datetime.datetime.fromisoformat(_SOME_DAY + cell if _is_time_without_date(cell) else iso_text)
     except ValueError:
         return math.nan
     return when.replace(tzinfo=when.tzinfo or datetime.UTC).timestamp()

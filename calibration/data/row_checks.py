@@ -220,7 +220,8 @@ def split_at_jumps(runs: Runs, at_rest: bool) -> Runs:
             "rig's file to begin a new run"
         )
     else:
-        for part, row in enumerate(jumps, 2):
+        for row in jumps:
+            part = 1 + np.count_nonzero(names[jumps[jumps <= row]] == names[row])
             after = (np.arange(len(time)) >= row) & (run == run[row])
             time = np.where(after, time - time[row], time)
             run = np.where(after, f"{names[row]} part {part}".strip(), run)
@@ -357,7 +358,7 @@ def _without_idle_rows(runs: Runs) -> Runs:
     if not idle.size:
         return runs
     drive_columns = (layout.imposed_column, *sides, *["duty"] * runs.has("duty"))
-    zero_columns = " and ".join(c for c in drive_columns if not runs[c][idle].any())
+    zero_columns = " and ".join(c for c in drive_columns if not runs[c][idle].any()) or layout.imposed_column
     why = f" although {zero_columns} is 0; give the command that drives it, or remove the row"
     for channel in (c for c in runs.present_channels if c.zero_at_rest):
         readings = np.abs(np.nan_to_num(runs[channel.column]))
@@ -372,7 +373,7 @@ def _without_idle_rows(runs: Runs) -> Runs:
             f"{runs.source}: {zero_columns} is 0 in every row, so nothing drives the motors; expected rows with a "
             f"command{clamp_advice * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
         )
-    why = f"nothing drives the motors ({zero_columns or layout.imposed_column} is 0)"
+    why = f"nothing drives the motors ({zero_columns} is 0)"
     note = f"{runs.source}: {_rows_are(idle)} left out, since {why}. Row numbers do not count them"
     return runs.where(drive != 0).with_columns({}, note)
 

@@ -196,7 +196,7 @@ def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.L
 
 
 def trace_known_readings(given: loop_input.LoopInput) -> verdict.LoopStages | None:
-    """Stages of the known linear readings of a log with other noise. None for other tables."""
+    """Runs the stages on the known linear readings of a log, with other noise. None for other tables."""
     shared_stages = given.known
     if (
         shared_stages is None
@@ -213,8 +213,10 @@ def trace_known_readings(given: loop_input.LoopInput) -> verdict.LoopStages | No
 
 
 def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate | None:
-    """Stages of the windows of a log with a long run. If they find nothing, the start of a simulated fit, because the
-    readings may still find something. None if a log has no windows, or if they give no start.
+    """Runs the stages on the windows of a log with a long run.
+
+    If they find nothing, the start of a simulated fit, because the readings may still find something. None if a log
+    has no windows, or if they give no start.
     """
     if (windows := log_stages.windows_of_log(given)) is None:
         return None
@@ -232,7 +234,7 @@ def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate
 def trace_settled_runs(
     given: loop_input.LoopInput, begin: Candidate | None, screened: Screening
 ) -> verdict.LoopStages | None:
-    """Stages of the settled runs of a log that no fit describes. None for other logs, and with too few such runs."""
+    """Runs the stages on the settled runs of a log that no fit describes. None for others, or with too few runs."""
     base = screened.base
     if given.shows_unmodelled_backlash or not base.space.bare.observe.long:
         return None
@@ -247,7 +249,7 @@ def trace_settled_runs(
 def trace_readings(
     given: loop_input.LoopInput, begin: Candidate | None, screened: Screening, sds: verdict.VerdictNoise
 ) -> verdict.LoopStages | None:
-    """Stages of the linear readings of a log about its simulated fit, and the simulation of the model that they
+    """Runs the stages on the linear readings of a log about its simulated fit, and simulates the model that they
     choose. None for other tables, and for a log with backlash that the robot lacks.
     """
     if given.shows_unmodelled_backlash or not screened.base.space.bare.observe.long:

@@ -67,9 +67,13 @@ def _fit_base(
     For logs, the equations in weak form give the start of the fit, and rank the library unless effects would only
     stand in for a backlash.
     """
-    settings, same = given.settings, noise is given.noise
-    space = given.equations or (given if same else dataclasses.replace(given, noise=noise)).space
-    near = None if before is None else before.candidate
+    settings, near = given.settings, None if before is None else before.candidate
+    if given.equations is not None:
+        space = given.equations
+        if noise is not given.noise:
+            space = space.with_noise(noise.sd, space.weight)
+    else:
+        space = (given if noise is given.noise else dataclasses.replace(given, noise=noise)).space
     if before is None:
         if begin is not None:  # as near as a simulated fit, and its effects are ranked
             near = dataclasses.replace(begin, simulated=True)
@@ -125,7 +129,7 @@ def search_until_clean(
         progress(progress_remark("effects"))
         screened, diagnosis, searched = keep(f"search {k}", functools.partial(search_effects, screened, diagnosis))
         after = searched.diagnosis
-        if after is None or not after.test.rejected_with_margin:
+        if after is None or not after.test.rejected_with_margin or k + 1 == SCREENINGS:
             break
         more = outliers.screen_with_effects(screened, after.scores, given.runs, settings)
         if more is None:

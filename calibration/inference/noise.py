@@ -122,7 +122,7 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
     Args:
         sizes: reference size of each reading [SI] for noise stated as a share, see `Observer.sizes`, shape (rows,
             channels).
-        stated: result of `parse_noise`.
+        stated: text for `parse_noise`.
 
     Raises:
         BadConfiguration: for the same reasons as `parse_noise`.

@@ -201,8 +201,10 @@ class SensitivityResult:
         return tuple(self.inputs)
 
     def importance(self) -> np.ndarray:
-        """Largest share of the variance that each input causes, over all outputs and points, shape (inputs,). Shares
-        at single points count with the upper ends of their intervals."""
+        """Largest share of the variance that each input causes, over all outputs and points, shape (inputs,).
+
+        At single points, the upper end of the confidence interval counts.
+        """
         shares = [np.zeros((1, len(self.inputs)))]
         for study in self.outputs.values():
             total = study.at_points.get("total")

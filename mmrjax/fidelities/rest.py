@@ -79,7 +79,10 @@ def output_is_held(conditions: Conditions) -> Array:
 
 
 def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
-    """Voltage of the driver at motors at rest without current [V]."""
+    """Voltage of the driver at the start [V].
+
+    That of a standing motor without current, or what an imposed speed or current needs.
+    """
     if conditions.motor_speed is not None:  # the voltage of the imposed speed
         return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
     if conditions.motor_current is not None:  # an amplifier's, see `balances.electrical`
@@ -242,7 +245,7 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
 
     `HELD` if they rest and friction holds them (`holding_margin`), both now and at the later current at rest. If
     friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. A clamp
-    holds them in any case. An imposed speed turns them in any case, 0 if it is 0.
+    always holds them. With an imposed speed it is the direction of that speed, 0 at rest, whatever holds them.
     """
     conditions = balances.with_controller_duty(robot, conditions, state)
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
@@ -290,7 +293,7 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
-    """True if a robot slides although its demand exceeds the limit of the ground. False if it stands.
+    """For a robot whose demand exceeds the limit of the ground: True if it slides, False if it stands.
 
     It slides down if gravity less rolling resistance exceeds the adhesion. It slides in place if the motors turn the
     movers faster than V_s. Up to V_s the traction of the ground increases with sliding speed.
@@ -313,7 +316,7 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
 
 
 def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Current that settles at the motor speed of `state` [A], by the secant method on its voltage balance."""
+    """Current that settles at the motor speed of `state` [A], by one secant step on its voltage balance."""
 
     def voltage_left(unlimited_current: Scalar) -> Scalar:
         current, blocked_voltage = admitted_current(robot, conditions, unlimited_current)

@@ -80,7 +80,7 @@ class Driver(eqx.Module):
         return jnp.where(pulsed, 1 / jnp.where(pulsed, jnp.abs(duty), 1.0), 1.0)
 
     def duty_limited(self, duty: Scalar, current: Scalar, polarity: Scalar = 1.0) -> Scalar:
-        """Duty D [-], -1 to 1, that holds the motor's `current` [A] at the limit.
+        """`duty` [-], reduced where the motor's `current` [A] exceeds the limit, so that it stays near the limit.
 
         `polarity` is the sign of the supply voltage.
         """
