@@ -213,6 +213,12 @@ def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs, robot)
         assert (np.diff(times[row[row >= 0]]) > 0).all() and (row >= 0).sum() == (names == name).sum()
 
 
+def test_included_runs_of_a_log_are_counted_not_its_rows(runs, robot):
+    names = runs["run_id"]
+    included = Histories.of(runs, robot).number_of_included_runs(names != names[0])
+    assert included == len(np.unique(names)) - 1
+
+
 # --- input checks ----------------------------------------------------------------------------------------
 
 

@@ -502,6 +502,9 @@ class Histories(Observer):
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return status == FAILED
 
+    def number_of_included_runs(self, included: np.ndarray) -> int:
+        return len(np.unique(np.asarray(self.run)[included]))
+
     def noise_misfit(self, residuals: Callable[[], np.ndarray], counts: np.ndarray) -> float:
         """Expected χ² of noise. It is larger than the number of readings if neighbouring samples show that the sds
         are too small.
