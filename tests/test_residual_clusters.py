@@ -7,6 +7,7 @@ import jsonschema
 import numpy as np
 import pytest
 from pages import Tables
+from synthetic import SETTLED
 from test_lack_of_fit import SIGMA, toy
 
 from calibration.data import runs as records
@@ -14,7 +15,7 @@ from calibration.data.runs import Runs
 from calibration.inference.calibration import calibrate
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.observers import Histories
-from calibration.inference.residual_clusters import find_residual_clusters
+from calibration.inference.residual_clusters import LEVEL, find_residual_clusters
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots
 from sweeps.report import calibration_report, page_renderer
@@ -230,8 +231,8 @@ def test_histories_are_compared_by_the_means_of_their_runs():
 
 
 @pytest.fixture(scope="module")
-def shifted():
-    """The fit of sixty runs of the packaged robot up to 10°, with noise, and two columns without a role. The speed is
+def shifted_runs():
+    """Sixty runs of the packaged robot up to 10°, with noise, and two columns without a role. The speed is
     shown 8 mm/s too high where wheel 1 idles, and half of it too low elsewhere."""
     rng, robot = np.random.default_rng(0), paper_robots.nominal()
     volts, slope, load, name = np.meshgrid([15.0, 18.0, 24.0], [0.0, 5.0, 10.0], [0.0, 3.0, 8.0], ["6T2A", "4W2T"])
@@ -248,8 +249,13 @@ def shifted():
     for k, column in enumerate(("total_current_A", "motor_speed_rpm", "speed_mm_s")):
         columns |= {column: reading[:, k], column.replace("_A", "_sd_A").replace("_rpm", "_sd_rpm").replace("_mm_s", "_sd_mm_s"): size[:, k]}  # fmt: skip
     extras = {"idle_wheel": wheel, "who": rng.choice(["Ann", "Bo"], wheel.size)}
-    runs = Runs("made", columns, tuple(extras), extras=extras)
-    return calibrate(runs, robot, starts=2, profiles=False, blocks=())
+    return Runs("made", columns, tuple(extras), extras=extras)
+
+
+@pytest.fixture(scope="module")
+def shifted(shifted_runs):
+    """The fit of these runs."""
+    return calibrate(shifted_runs, paper_robots.nominal(), starts=2, profiles=False, blocks=())
 
 
 @pytest.mark.slow
@@ -279,3 +285,10 @@ def test_columns_without_a_role_keep_their_cells(tmp_path):
     some = runs.where(np.array([False, True, True]))
     assert some.extras["who"].tolist() == ["Bo", "Ann"] and len(some) == 2
     assert records.read_runs("measured").extras.keys() == set(records.read_runs("measured").unknown)
+
+
+@pytest.mark.slow
+def test_the_loop_lists_columns_by_which_residuals_of_its_last_fit_cluster(shifted_runs):
+    found = SETTLED.discover(shifted_runs)
+    assert [(c.column, c.channel) for c in found.residual_clusters] == [("idle_wheel", "speed")]
+    assert found.to_json()["residual_clusters"][0]["p"] < LEVEL
