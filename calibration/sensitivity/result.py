@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from calibration.data import Columns, Json, Names
 from calibration.data.runs import Runs
@@ -335,7 +335,7 @@ def interactions(study: OutputStudy, names: Names) -> list[Json]:
     relevant = np.flatnonzero(np.nan_to_num(study.overall["total"].value) >= NEGLIGIBLE / 10)
     pairs = list(itertools.combinations(relevant.tolist(), 2))
     # in 95 of 100 studies no pair is sure by chance (Bonferroni)
-    quantiles = stats.t.ppf(1 - (1 - LEVEL) / 2 / np.array([1, max(len(pairs), 1)]), REPLICATES - 1)
+    quantiles = stdtrit(REPLICATES - 1, 1 - (1 - LEVEL) / 2 / np.array([1, max(len(pairs), 1)]))
     entries: list[Json] = []
     for pair in pairs:
         value, low, high = (float(x[pair]) for x in second)
