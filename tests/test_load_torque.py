@@ -255,3 +255,27 @@ def test_every_fidelity_settles_alike_under_a_brake():
     times = time_grid(np.linspace(0, 4.0, 9))
     shown = jax.jit(history_signals)(bench(), Conditions(voltage=24.0, load_torque=0.5), jnp.asarray(times))
     assert_allclose(shown.speed_motor[-1], at.motor_speed[0], rtol=1e-6)
+
+
+@pytest.mark.nightly
+def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
+    """Of one voltage, from a file that is off by a tenth: R 0.5, k 0.05, M0 0.01."""
+    torque = np.round(np.arange(9) * 0.1, 1)
+    current = (torque + 0.01) / 0.05
+    speed = (24 - 0.5 * current) / 0.05 * 30 / np.pi
+    current += 0.003 * default_rng(1).standard_normal(9)  # an exact line would be a computed current
+    head = 'channels = ["motor_current", "motor_speed"]\n[columns]\nload_torque_Nm = "output_torque_Nm"'
+    off = RIG.format(head=head)
+    for true, stated in ((0.5, "0.54 ± 10 %"), (0.05, "0.047 ± 10 %"), (0.01, "0.02 ± 100 %"), ("1.0", "1 ± 0")):
+        off = off.replace(f" = {true}\n", f' = "{stated}"\n')
+    rig = read_rig(tmp_path, off)
+    columns = {
+        "supply_voltage_V": np.full(9, 24.0),
+        "motor_speed_rpm": np.round(speed, 1),
+        "output_torque_Nm": torque,
+    }
+    runs = mm.read_runs(columns | {"motor_current_A": np.round(current, 3)}, robot=rig)
+    found = mm.discover(runs, rig, noise="motor_current=0.003 A,motor_speed=0.03 rpm")
+    assert found.verdict == "none"
+    for name, value in {"resistance": 0.5, "torque_constant": 0.05, "friction_coulomb": 0.01}.items():
+        assert_allclose(getattr(found.robot.motor, name), value, rtol=0.01)
