@@ -221,7 +221,7 @@ def split_at_jumps(runs: Runs, at_rest: bool) -> Runs:
         )
     else:
         for row in jumps:
-            part = 1 + np.count_nonzero(names[jumps[jumps <= row]] == names[row])
+            part = 1 + len({*run[names == names[row]]})
             after = (np.arange(len(time)) >= row) & (run == run[row])
             time = np.where(after, time - time[row], time)
             run = np.where(after, f"{names[row]} part {part}".strip(), run)

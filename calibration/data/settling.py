@@ -55,12 +55,12 @@ MOST_GLITCHES, BESIDE = 0.25, (21, 101)
 OF_YAW = tuple(c.name for c in channels.OF_TURNS if c.directed and c.side is None)
 #: Conditions that end a stretch whenever they change.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
-#: Reasons for omitting samples: finding and advice.
+#: Reasons for omitting samples: finding, advice, and an option of `settle` that helps.
 REASONS = {
     "changes": ("the imposed quantity always changes", "hold each level for a while"),
-    "short": ("the level is held too briefly", "hold it longer, or lower --shortest"),
-    "settling": ("still changes at the end of its level", "hold it longer, or raise --drift"),
-    "accelerates": ("still accelerates at the end of its level", "hold it longer, or raise --drift"),
+    "short": ("the level is held too briefly", "hold it longer", "lower --shortest"),
+    "settling": ("still changes at the end of its level", "hold it longer", "raise --drift"),
+    "accelerates": ("still accelerates at the end of its level", "hold it longer", "raise --drift"),
     "idle": ("nothing drives the motors", "nothing"),
     "rest": ("the drive does not move", "nothing, friction holds the drive"),
     "stuck": ("is saturated or frozen", "check the instrument"),
@@ -755,17 +755,17 @@ def _nothing_settled_message(settled: Settled) -> str:
     by_reason = {why: [s for s in settled.stretches if s.why == why] for why in REASONS}
     why = max(by_reason, key=lambda why: sum(s.lasts for s in by_reason[why]))
     longest = max(by_reason[why], key=lambda s: s.lasts)
-    advice = REASONS[why][1]
+    _, advice, *options = REASONS[why]
+    # Turns are sought by calibrate and loop, which have no options of settle.
+    others = (
+        ["give one command for straight travel"] if settled.runs.turns else [*options, "use the log itself with loop"]
+    )
     cure = "log driven motion" if advice.startswith("nothing") else advice
-    if settled.runs.turns:  # found by calibrate and loop, which have no options of settle
-        cure, alternative = cure.partition(", or")[0], "give one command for straight travel"
-    else:
-        alternative = "use the log itself with loop"
     place = settled.runs.place(longest.rows[0], longest.rows[-1])
     return (
         f"{place}: no settled segment: {longest.reason}. This level has {longest.lasts:.3g} s and "
         f"{count_noun(len(longest.rows), 'sample')}; expected at least {settled.shortest:.3g} s and {FEWEST} "
-        f"samples; {cure}, or {alternative}"
+        f"samples; {', or '.join((cure, *others))}"
     )
 
 

@@ -68,12 +68,11 @@ def _fit_base(
     stand in for a backlash.
     """
     settings, near = given.settings, None if before is None else before.candidate
-    if given.equations is not None:
-        space = given.equations
-        if noise is not given.noise:
-            space = space.with_noise(noise.sd, space.weight)
-    else:
+    space = given.equations
+    if space is None:
         space = (given if noise is given.noise else dataclasses.replace(given, noise=noise)).space
+    elif noise is not given.noise:
+        space = space.with_noise(noise.sd, space.weight)
     if before is None:
         if begin is not None:  # as near as a simulated fit, and its effects are ranked
             near = dataclasses.replace(begin, simulated=True)

@@ -598,8 +598,8 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
 
     def linearise_about(origin: np.ndarray) -> tuple[Any, ...]:
         """Function that returns residuals and their derivatives at z, and derivatives of the terms with respect to
-        effects. Then the factors of the covariance, states without noise, and terms there and at the readings, all
-        of which are those of the origin.
+        effects. Then the factors of the covariance, states without noise, and terms there and at the readings. These
+        do not depend on z: they are computed at the origin.
         """
         smooth = with_smooth_states(problem, plan, rows, jnp.asarray(origin))
         smooth_terms, reading_terms = terms(smooth, origin), terms(rows, origin)

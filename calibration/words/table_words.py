@@ -213,7 +213,7 @@ def omitted_stretches(stretches: Iterable[Stretch], few: bool = False) -> list[t
         stretches_of_reason = [s for s in omitted if s.why == why]
         longest = max(stretches_of_reason, key=lambda s: len(s.rows))
         row_range = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
-        cure = "nothing, a fit to the log uses them" if few and why in OF_LEVELS else REASONS[why][1]
+        cure = "nothing, a fit to the log uses them" if few and why in OF_LEVELS else ", or ".join(REASONS[why][1:])
         rows.append(
             (
                 longest.reason,

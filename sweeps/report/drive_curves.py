@@ -47,7 +47,7 @@ DRIVE_BALANCES = ("duty", "supply", "electrical", "motor", "gearbox")
 
 
 def _runs_on_a_shaft(robot: Robot, voltage: float, load: np.ndarray) -> tuple[Results, np.ndarray]:
-    """Steady runs of the robot's drive with a frictionless shaft as its load, and True for those that turn forward.
+    """Steady runs of the robot's drive with a frictionless shaft as its load, and a mask of runs that turn forward.
 
     Args:
         load: torques of the load [N·m].

@@ -199,7 +199,7 @@ def ripple_table(ripples: Sequence[Any]) -> Table:
 
 
 def _power(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[Block]:
-    """Power chains of the runs that settled, and the chart of motor and gear with those that run forward."""
+    """Power chains of the settled runs, and the chart of motor and gearbox with the forward ones."""
     from sweeps.pages import power_figures
 
     settled = np.isin(runs["status"], words.SETTLED)
